@@ -1,0 +1,53 @@
+"""A backend owns what its devices share: a simulated world, a bus, a controller, a recording."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from dualcal_hal.camera import Camera
+from dualcal_hal.clock import Clock
+from dualcal_hal.robot import Robot
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from dualcal_hal.config import CellFile
+
+
+class Backend(ABC):
+    """One instance for each name under ``backends`` in the cell file.
+
+    time: "drives" if it makes time (a simulator, a replay), "real" if it lives in it.
+    simulated: whether no real device stands behind it.
+    Options: the pydantic model of its entry under ``backends``.
+    """
+
+    time: ClassVar[Literal["drives", "real"]]
+    simulated: ClassVar[bool]
+    Options: ClassVar[type[BaseModel]]
+
+    def __init__(self, name: str, cell: CellFile) -> None:
+        self.name = name
+        self.cell = cell
+
+    @property
+    @abstractmethod
+    def clock(self) -> Clock:
+        """The clock its devices' times are of."""
+
+    @abstractmethod
+    def open(self, timeout: float) -> None:
+        """Make its devices usable, or raise and leave nothing open. Opening an open one is an error."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop and release everything; any number of times, also after a failed open."""
+
+    @abstractmethod
+    def robot(self, name: str) -> Robot:
+        """The arm of that name in the cell file; UnknownDevice if it has none."""
+
+    @abstractmethod
+    def camera(self, name: str) -> Camera:
+        """The camera of that name; UnknownDevice if it has none."""

@@ -1,0 +1,109 @@
+"""The one tree of errors.
+
+    DualcalError
+    ├── CellFileError (ValueError)          the cell file, or a value given with --set
+    ├── FormatError (ValueError)            a public file (captures, result, session) that cannot be read
+    ├── UsageError (ValueError)             a call that cannot be carried out as asked
+    ├── DegenerateCaptures (ValueError)     captures that do not determine what is sought
+    ├── NoPlan (RuntimeError)               no poses or no way that keep all conditions
+    ├── Interrupted                         SIGINT, SIGTERM or an abort by the operator
+    └── DeviceError                         names the device, what was attempted and what to do
+        ├── NotOpen (RuntimeError)
+        ├── UnknownDevice (LookupError)
+        ├── DeviceTimeout (TimeoutError)
+        ├── LinkLost (ConnectionError)
+        ├── CommandRefused (ValueError)     by the guard or the device, before anything moved
+        ├── MotionStopped (RuntimeError)
+        └── MotionFailed (RuntimeError)
+
+Leaves also inherit the fitting builtin. No third party's exception crosses a backend's border.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+class DualcalError(Exception):
+    """Anything this program has to say about why it does not go on."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing wrong in a file: where (``cell.yaml:6:5``, ``--set a.b``, a capture's id) and what."""
+
+    where: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.what}" if self.where else self.what
+
+
+class _WithProblems(DualcalError):
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(str(problem) for problem in self.problems))
+
+
+class CellFileError(_WithProblems, ValueError):
+    """The cell file is not usable; ``problems`` holds all that was found, in the file's order."""
+
+
+class FormatError(_WithProblems, ValueError):
+    """A captures, result or session file is not usable; ``problems`` holds all that was found."""
+
+
+class UsageError(DualcalError, ValueError):
+    """The call cannot be carried out as it was asked."""
+
+
+class DegenerateCaptures(DualcalError, ValueError):
+    """The captures do not determine what is sought; the message says which condition failed."""
+
+
+class NoPlan(DualcalError, RuntimeError):
+    """No poses or no way found; the message says which condition failed how often."""
+
+
+class Interrupted(DualcalError):
+    """The operator, SIGINT or SIGTERM asked for an end."""
+
+
+class DeviceError(DualcalError):
+    """A device did not do what it was asked."""
+
+    def __init__(self, device: str, attempted: str, why: str, advice: str = "") -> None:
+        self.device = device
+        self.attempted = attempted
+        self.why = why
+        self.advice = advice
+        super().__init__(f"{device}: {attempted}: {why}" + (f"; {advice}" if advice else ""))
+
+
+class NotOpen(DeviceError, RuntimeError):
+    """The device was used before it was opened or after it was closed."""
+
+
+class UnknownDevice(DeviceError, LookupError):
+    """The backend has no device of that name."""
+
+
+class DeviceTimeout(DeviceError, TimeoutError):
+    """The device did not answer or finish in time."""
+
+
+class LinkLost(DeviceError, ConnectionError):
+    """The connection to the device is gone."""
+
+
+class CommandRefused(DeviceError, ValueError):
+    """A command that must not be sent was not sent."""
+
+
+class MotionStopped(DeviceError, RuntimeError):
+    """The motion was ended by a stop before it arrived."""
+
+
+class MotionFailed(DeviceError, RuntimeError):
+    """The motion was ended by a fault before it arrived."""

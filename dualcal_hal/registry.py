@@ -1,0 +1,37 @@
+"""Backends by name, imported only when a cell file names them."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import entry_points
+
+from dualcal_hal.backend import Backend
+from dualcal_hal.errors import UsageError
+
+ENTRY_POINT_GROUP = "dualcal.backends"
+
+_BUILT_IN = {
+    "simulator": "backends.simulator:SimulatorBackend",
+}
+
+
+def backend_names() -> list[str]:
+    """All names a cell file may use, sorted."""
+    return sorted(_locations())
+
+
+def backend_class(name: str) -> type[Backend]:
+    """The class behind a name; UsageError names those there are."""
+    location = _locations().get(name)
+    if location is None:
+        raise UsageError(f"unknown backend '{name}'; there are: {', '.join(backend_names())}")
+    module, _, attribute = location.partition(":")
+    found = getattr(import_module(module), attribute)
+    if not (isinstance(found, type) and issubclass(found, Backend)):
+        raise UsageError(f"backend '{name}': {location} is no Backend")
+    return found
+
+
+def _locations() -> dict[str, str]:
+    extensions = {entry.name: entry.value for entry in entry_points(group=ENTRY_POINT_GROUP)}
+    return {**extensions, **_BUILT_IN}

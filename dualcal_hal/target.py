@@ -1,0 +1,41 @@
+"""The checkerboard on the passive arm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dualcal_hal.transforms import Array
+
+
+@dataclass(frozen=True)
+class Checkerboard:
+    """``rows`` x ``columns`` inner corners, ``square`` in m; ``feature`` is the index of the feature point.
+
+    Frame T has its origin in the feature point, x right and y up when looked at from the front, z towards
+    the viewer. Corner (i, j) has index ``i * columns + j``, read from the front like text.
+    """
+
+    rows: int
+    columns: int
+    square: float
+    feature: int
+
+    @cached_property
+    def corners(self) -> Array:
+        """(rows * columns, 3): the corners in T, m."""
+        i, j = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        x = (j - (self.columns - 1) / 2) * self.square
+        y = ((self.rows - 1) / 2 - i) * self.square
+        corners = np.stack([x, y, np.zeros_like(x)], axis=1)
+        return np.asarray(corners - corners[self.feature])
+
+    @cached_property
+    def outline(self) -> Array:
+        """(4, 3): the outer corners of the pattern's squares in T, m (one square beyond the inner corners)."""
+        lowest, highest = self.corners.min(axis=0), self.corners.max(axis=0)
+        x0, y0 = lowest[:2] - self.square
+        x1, y1 = highest[:2] + self.square
+        return np.array([[x0, y1, 0.0], [x1, y1, 0.0], [x1, y0, 0.0], [x0, y0, 0.0]])

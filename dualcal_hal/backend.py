@@ -12,7 +12,7 @@ from dualcal_hal.robot import Robot
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from dualcal_hal.config import CellFile
+    from dualcal_hal.cellfile import CellFile
 
 
 class Backend(ABC):

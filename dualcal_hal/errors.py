@@ -14,7 +14,8 @@
         ├── LinkLost (ConnectionError)
         ├── CommandRefused (ValueError)     by the guard or the device, before anything moved
         ├── MotionStopped (RuntimeError)
-        └── MotionFailed (RuntimeError)
+        ├── MotionFailed (RuntimeError)
+        └── ArmMoved (RuntimeError)
 
 Leaves also inherit the fitting builtin. No third party's exception crosses a backend's border.
 """
@@ -107,3 +108,7 @@ class MotionStopped(DeviceError, RuntimeError):
 
 class MotionFailed(DeviceError, RuntimeError):
     """The motion was ended by a fault before it arrived."""
+
+
+class ArmMoved(DeviceError, RuntimeError):
+    """An arm moved while a picture was taken; the capture is refused."""

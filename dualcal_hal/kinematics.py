@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dualcal_hal.transforms import Array, rotation_from_vector, transform, vector_from_rotation
+from dualcal_hal.transforms import Array, Mask, rotation_from_vector, transform, vector_from_rotation
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Chain:
         *,
         iterations: int = 60,
         tolerance: float = 1e-10,
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Mask]:
         """Joint angles that bring the flange to given poses, by damped Newton steps from given starts.
 
         flange: (k, 4, 4) or (4, 4) poses in the base; starts: (k, n) in rad; lower, upper: (n,) limits

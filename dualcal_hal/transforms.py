@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
@@ -35,7 +36,8 @@ def inverse(T: ArrayLike) -> Array:
 def apply(T: ArrayLike, points: ArrayLike) -> Array:
     """Coordinates (..., n, 3) in frame Y to frame X by ``T_X_Y`` (..., 4, 4)."""
     T = np.asarray(T, dtype=float)
-    return np.asarray(points, dtype=float) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+    turned = np.asarray(points, dtype=float) @ np.swapaxes(T[..., :3, :3], -1, -2)
+    return np.asarray(turned + T[..., None, :3, 3])
 
 
 def skew(v: ArrayLike) -> Array:

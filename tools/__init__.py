@@ -1,0 +1,1 @@
+"""The `dualcal` command line and the benchmarks."""

@@ -1,0 +1,98 @@
+"""The virtual cell: both arms and the camera in one world, in simulated time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from backends.simulator.camera import SimulatedCamera
+from backends.simulator.rendering import Renderer
+from backends.simulator.robot import SimulatedRobot
+from backends.simulator.world import World
+from dualcal_hal.backend import Backend
+from dualcal_hal.clock import VirtualClock
+from dualcal_hal.errors import CellFileError, NotOpen, Problem, UnknownDevice, UsageError
+
+if TYPE_CHECKING:
+    from dualcal_hal.cellfile import CellFile
+    from dualcal_hal.config import SimulationConfig
+
+CAMERA = "camera"
+
+
+class SimulatorOptions(BaseModel):
+    """The simulator has no options: what it simulates is under ``simulation``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SimulatorBackend(Backend):
+    """Simulates a whole cell; CellFileError if a device of the cell is another backend's.
+
+    Its time is virtual and goes on over closing and opening; its arms are at home again after opening.
+    """
+
+    time: ClassVar[Literal["drives", "real"]] = "drives"
+    simulated: ClassVar[bool] = True
+    Options: ClassVar[type[BaseModel]] = SimulatorOptions
+
+    def __init__(self, name: str, cell: CellFile) -> None:
+        super().__init__(name, cell)
+        self._simulation = _simulation(name, cell)
+        self._clock = VirtualClock()
+        self._open: tuple[World, Renderer] | None = None
+        robots = cell.cell.robots.items()
+        self._robots = {arm: SimulatedRobot(arm, config, self._opened_world) for arm, config in robots}
+        self._camera = SimulatedCamera(CAMERA, self._opened)
+
+    @property
+    def clock(self) -> VirtualClock:
+        return self._clock
+
+    def open(self, timeout: float) -> None:
+        if self._open is not None:
+            raise UsageError(f"{self.name}: open: it is open already; close it first")
+        cell = self.cell.cell
+        board, margin = cell.target.board, cell.target.margin
+        renderer = Renderer(board, margin, cell.camera.intrinsics, self._simulation.noise.blur_px)
+        self._open = World(cell, self._simulation, self._clock), renderer
+
+    def close(self) -> None:
+        opened, self._open = self._open, None
+        if opened is not None:
+            opened[0].close()
+
+    def robot(self, name: str) -> SimulatedRobot:
+        if name not in self._robots:
+            raise UnknownDevice(name, "find the arm", f"'{self.name}' has {', '.join(sorted(self._robots))}")
+        return self._robots[name]
+
+    def camera(self, name: str) -> SimulatedCamera:
+        if name != CAMERA:
+            raise UnknownDevice(name, "find the camera", f"'{self.name}' has {CAMERA}")
+        return self._camera
+
+    def _opened(self, device: str, attempted: str) -> tuple[World, Renderer]:
+        if self._open is None:
+            raise NotOpen(device, attempted, f"backend '{self.name}' is not open", "open it first")
+        return self._open
+
+    def _opened_world(self, device: str, attempted: str) -> World:
+        return self._opened(device, attempted)[0]
+
+
+def _simulation(name: str, cell: CellFile) -> SimulationConfig:
+    """The cell's ``simulation`` section, once the cell is one that this backend can simulate."""
+    devices = {f"robots.{arm}.backend": config.backend for arm, config in cell.cell.robots.items()}
+    devices["camera.backend"] = cell.cell.camera.backend
+    problems = [
+        Problem(where, f"is '{backend}': the simulator '{name}' simulates the whole cell, not a part of it")
+        for where, backend in devices.items()
+        if backend != name
+    ]
+    if cell.simulation is None:
+        problems.append(Problem("simulation", f"missing key: the simulator '{name}' needs it"))
+    if problems or cell.simulation is None:
+        raise CellFileError(problems)
+    return cell.simulation

@@ -1,0 +1,73 @@
+"""The one world that the simulated arms and camera share: the truth, and where everything is at a time."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from backends.simulator.arm import SimulatedArm
+from backends.simulator.noise import generator
+from dualcal_hal.clock import Clock
+from dualcal_hal.robot import Joints
+from dualcal_hal.transforms import Array, inverse
+
+if TYPE_CHECKING:
+    from dualcal_hal.config import CellConfig, SimulationConfig
+
+
+class World:
+    """A cell as it truly is, in the time of ``clock``; both arms begin at home.
+
+    Everything in it happens under ``lock`` and may be asked for from any thread; ``closed`` ends all waiting.
+    """
+
+    def __init__(self, cell: CellConfig, simulation: SimulationConfig, clock: Clock) -> None:
+        self.clock = clock
+        self.noise = simulation.noise
+        self.lock = threading.RLock()
+        self.closed = threading.Event()
+        self._cell = cell
+        self._truth = simulation.truth
+        self._chains = simulation.truth.chains(cell)
+        self._seed = simulation.seed
+        self._samples: Counter[tuple[str, str]] = Counter()
+        self.arms = {name: SimulatedArm(name, robot, self) for name, robot in sorted(cell.robots.items())}
+
+    def T_E_T(self, when: float) -> Array:
+        """(4, 4): the target in the camera at time ``when``, by the true transforms, chains and joint angles."""
+        active, passive = self._cell.active_name, self._cell.passive_name
+        with self.lock:
+            T_A_H = self._chains[active].forward(self.arms[active].true_positions(when))
+            T_P_F = self._chains[passive].forward(self.arms[passive].true_positions(when))
+        T_P_E = self._truth.T_P_A @ T_A_H @ self._truth.T_H_E
+        T_P_T = T_P_F @ self._cell.passive.target_mount_transform
+        return inverse(T_P_E) @ T_P_T
+
+    def joint_error(self, arm: str, target: Joints) -> Array:
+        """(n,) rad that the encoders do not see, of an arm that was sent to ``target``: always the same."""
+        drawn = generator(self._seed, arm, "joint error", *target).standard_normal(len(target))
+        return np.asarray(self.noise.joint * drawn)
+
+    def sample_noise(self, device: str, stream: str) -> np.random.Generator:
+        """The source of noise for the device's next sample of ``stream`` (call under the lock).
+
+        Its key is the seed, the device, the stream, where all arms were sent, and the sample's number since
+        the last of these targets changed.
+        """
+        number = self._samples[device, stream]
+        self._samples[device, stream] += 1
+        targets = (angle for arm in self.arms.values() for angle in arm.target)
+        return generator(self._seed, device, stream, number, *targets)
+
+    def target_changed(self) -> None:
+        """An arm was sent elsewhere: samples are counted anew (call under the lock)."""
+        self._samples.clear()
+
+    def close(self) -> None:
+        """End all motions and all waiting."""
+        self.closed.set()
+        for arm in self.arms.values():
+            arm.halt("the simulator was closed")

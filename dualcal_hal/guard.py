@@ -1,0 +1,166 @@
+"""The last look before anything is sent to an arm. No configuration takes it away."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualcal_hal.clock import Clock
+from dualcal_hal.errors import CommandRefused
+from dualcal_hal.geometry import CellGeometry, interpolate
+from dualcal_hal.robot import JointPath, Mode, Motion, Robot, RobotState, StopResult
+from dualcal_hal.transforms import Array
+
+READ_TIMEOUT = 0.5
+"""Seconds within which an arm must answer with its state."""
+
+OLDEST_FEEDBACK = 0.1
+"""Seconds after which a state no longer says where an arm is."""
+
+PLANNERS_SHARE = 0.5
+"""Part of the clearance that the guard insists on; the rest is what plans and the reading of joints may differ by."""
+
+_LIMIT_TOLERANCE = 1e-6  # rad, for what rounding does at a limit
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimits:
+    """lower, upper: (n,) rad; speed: (n,) rad/s; acceleration: (n,) rad/s^2, all largest allowed."""
+
+    lower: Array
+    upper: Array
+    speed: Array
+    acceleration: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where the arms are believed to stand to each other, with their shapes."""
+
+    geometry: CellGeometry
+    T_P_A: Array
+
+
+class CellGuard:
+    """Holds both arms; every motion of either passes here.
+
+    Refused with CommandRefused before the first byte: values that are not finite or too many or few, positions
+    beyond limits, speeds beyond the arm's, an arm that is not ready or whose state is not fresh, and paths that
+    come closer than half the clearance to the other arm, the floor or the arm itself.
+    """
+
+    def __init__(self, active: GuardedRobot, passive: GuardedRobot, placement: Placement, clearance: float) -> None:
+        self._active, self._passive = active, passive
+        self._placement = placement
+        self._clearance = clearance * PLANNERS_SHARE
+        active.admit(self._check_active)
+        passive.admit(self._check_passive)
+
+    def place(self, placement: Placement) -> None:
+        """Judge clearance by another belief from here on."""
+        self._placement = placement
+
+    def _check_active(self, path: Array) -> None:
+        other = self._passive.fresh_state("move the other arm")
+        body, geometry = self._placement.geometry.active, self._placement.geometry
+        between = geometry.between(path, [other.positions], self._placement.T_P_A)
+        self._require(self._active.name, np.minimum(body.own_clearance(path), between))
+
+    def _check_passive(self, path: Array) -> None:
+        other = self._active.fresh_state("move the other arm")
+        body, geometry = self._placement.geometry.passive, self._placement.geometry
+        between = geometry.between([other.positions], path, self._placement.T_P_A)
+        self._require(self._passive.name, np.minimum(body.own_clearance(path), between))
+
+    def _require(self, arm: str, clearance: Array) -> None:
+        # An arm that already stands too close may move away, never closer.
+        allowed = min(self._clearance, float(clearance[0]) - 1e-9)
+        least = float(np.min(clearance))
+        if least < allowed:
+            raise CommandRefused(
+                arm,
+                "move",
+                f"the path comes within {least * 1e3:.1f} mm of the other arm, the floor or itself, "
+                f"{allowed * 1e3:.1f} mm are the least",
+                "nothing was sent; plan anew or check the nominal transforms in the cell file",
+            )
+
+
+class GuardedRobot(Robot):
+    """A robot that starts no motion which its limits, its state or the cell forbid."""
+
+    def __init__(self, robot: Robot, limits: JointLimits, clock: Clock) -> None:
+        self.name = robot.name
+        self._robot = robot
+        self._limits = limits
+        self._clock = clock
+        self._check_cell: Callable[[Array], None] | None = None
+
+    def admit(self, check: Callable[[Array], None]) -> None:
+        """Let ``check`` judge each sampled path (k, n); without it nothing moves (called by CellGuard)."""
+        self._check_cell = check
+
+    @property
+    def joints(self) -> int:
+        return self._robot.joints
+
+    def read(self, timeout: float) -> RobotState:
+        return self._robot.read(timeout)
+
+    def subscribe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
+        return self._robot.subscribe(function)
+
+    def start(self, path: JointPath) -> Motion:
+        if self._check_cell is None:
+            raise CommandRefused(self.name, "move", "the cell is not open", "open it first")
+        self._check_values(path)
+        state = self.fresh_state("move")
+        if state.mode is not Mode.READY or state.faults:
+            what = ", ".join([f"mode '{state.mode}'", *state.faults])
+            raise CommandRefused(self.name, "move", f"the arm is not ready: {what}", "clear it at the controller")
+        self._check_cell(interpolate([state.positions, *path.waypoints]))
+        return self._robot.start(path)
+
+    def stop(self, reason: str) -> StopResult:
+        return self._robot.stop(reason)
+
+    def enable(self, timeout: float) -> None:
+        self._robot.enable(timeout)
+
+    def disable(self, timeout: float) -> None:
+        self._robot.disable(timeout)
+
+    def reset_fault(self, timeout: float) -> None:
+        self._robot.reset_fault(timeout)
+
+    def fresh_state(self, attempted: str) -> RobotState:
+        """The arm's state, read now; CommandRefused if it is older than it may be."""
+        state = self._robot.read(READ_TIMEOUT)
+        age = self._clock.now() - state.time
+        if age > OLDEST_FEEDBACK:
+            raise CommandRefused(self.name, attempted, f"its state is {age:.2f} s old", "check the link to the arm")
+        return state
+
+    def _check_values(self, path: JointPath) -> None:
+        limits = self._limits
+        for what, values in (*(("waypoint", w) for w in path.waypoints), ("speed", path.speed)):
+            if len(values) != self.joints or not np.all(np.isfinite(values)):
+                self._refuse(f"a {what} is not {self.joints} finite numbers: {values}")
+        waypoints = np.array(path.waypoints)
+        beyond = np.maximum(limits.lower - waypoints, waypoints - limits.upper)
+        if len(path.waypoints) == 0:
+            self._refuse("the path is empty")
+        if np.max(beyond) > _LIMIT_TOLERANCE:
+            joint = int(np.unravel_index(np.argmax(beyond), beyond.shape)[1])
+            self._refuse(f"joint {joint + 1} would be {np.rad2deg(np.max(beyond)):.3f} deg beyond its limit")
+        for what, values, largest in (
+            ("speed", path.speed, limits.speed),
+            ("acceleration", path.acceleration, limits.acceleration),
+        ):
+            if np.any(np.asarray(values) > largest * (1 + 1e-9)) or np.any(np.asarray(values) <= 0):
+                self._refuse(f"the {what} is not between zero and the arm's own")
+
+    def _refuse(self, why: str) -> None:
+        raise CommandRefused(self.name, "move", why, "nothing was sent; this is an error in the plan")

@@ -1,0 +1,1 @@
+"""A run on disk: what was done, what was seen, what came of it."""

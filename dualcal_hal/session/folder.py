@@ -1,0 +1,59 @@
+"""The folder of a run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from dualcal_hal.camera import Image
+from dualcal_hal.errors import UsageError
+from dualcal_hal.session.files import write_atomically
+from dualcal_hal.session.journal import Journal
+
+
+class Session:
+    """``cell.yaml`` as used, ``plan.json``, ``journal.jsonl``, ``captures.json``, ``images/``, ``result.json``."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.journal = Journal(folder / "journal.jsonl")
+
+    @staticmethod
+    def create(folder: Path, cell_text: str) -> Session:
+        """A new session in an empty or not yet existing folder, else UsageError."""
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UsageError(f"{folder}: exists and is not an empty folder; name another with --out")
+        try:
+            (folder / "images").mkdir(parents=True)
+            write_atomically(folder / "cell.yaml", cell_text.encode())
+        except OSError as error:
+            raise UsageError(f"{folder}: cannot be written: {error.strerror}") from error
+        return Session(folder)
+
+    @property
+    def cell_path(self) -> Path:
+        return self.folder / "cell.yaml"
+
+    @property
+    def captures_path(self) -> Path:
+        return self.folder / "captures.json"
+
+    @property
+    def result_path(self) -> Path:
+        return self.folder / "result.json"
+
+    def image_path(self, name: str) -> Path:
+        """Where the image of a capture or look is kept."""
+        return self.folder / "images" / f"{name.replace('/', '-')}.png"
+
+    def write_image(self, name: str, image: Image) -> None:
+        """Store an image losslessly and durably."""
+        import cv2
+
+        _, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        write_atomically(self.image_path(name), png.tobytes())
+
+    def write_document(self, file_name: str, document: dict[str, Any]) -> None:
+        """Store a JSON document durably, all of it or nothing."""
+        write_atomically(self.folder / file_name, json.dumps(document, indent=1, allow_nan=False).encode() + b"\n")

@@ -1,0 +1,262 @@
+"""Alignment (paper, section 4.2): the passive arm brings the feature point onto the optical axis.
+
+A picture is taken after each settled move. The passive arm shifts the target in the camera plane and keeps its
+orientation; the image Jacobian comes from the board's pose in the constraint's first picture, is corrected by what
+moves bring about (Broyden) and kept along the constraint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from dualcal_hal.errors import UsageError
+from dualcal_hal.robot import Joints
+from dualcal_hal.transforms import Array, inverse, rotation_angle, transform
+from procedures.detection import Detection, Detector, Missed, board_poses
+from procedures.estimation.projection import undistort
+from procedures.planning.belief import Belief
+from procedures.planning.model import CellModel, Posture
+from procedures.planning.refine import arrival_scatter
+from procedures.planning.ways import WayFinder
+from procedures.steps import Procedure, Sighting, look, move, read
+
+MOST_FRAMES = 12
+ACCEPTABLE_PX = 1.0
+"""An offset (px) within which a point that did not converge is still captured, marked as such."""
+
+LONGEST_STEP = 0.3
+"""m; a longer correction is a wrong one."""
+
+LEAST_CHANGE_PX = 0.5
+"""px; smaller changes are noise and teach the Jacobian nothing."""
+
+AUTO_TOLERANCE = 2.8
+"""``auto`` in units of the arrivals' scatter: 99 % of arrivals at the right place are within it in both axes."""
+
+LEAST_AUTO_PX = 0.02
+"""px; ``auto`` does not go below what the detection of corners resolves."""
+
+_POSE_ROTATION_SIGMA = 0.03  # rad; orientation of a small board from one picture
+_WORST_CONDITION = 5.0  # of the Jacobian, in units in which it is near a rotation
+
+
+class Outcome(StrEnum):
+    ALIGNED = "aligned"
+    NOT_CONVERGED = "not converged"
+    LOST = "lost"
+    OUT_OF_REACH = "out of reach"
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """What came of one point. ``sighting`` and ``detection`` are of the last picture, if the target was seen there."""
+
+    outcome: Outcome
+    frames: int
+    offset: Array | None  # (2,) px from the principal point
+    reason: str = ""
+    sighting: Sighting | None = None
+    detection: Detection | None = None
+
+    @property
+    def captured(self) -> bool:
+        """Whether the point is one to calibrate with."""
+        if self.outcome is Outcome.ALIGNED:
+            return True
+        near = self.offset is not None and bool(np.max(np.abs(self.offset)) <= ACCEPTABLE_PX)
+        return self.outcome is Outcome.NOT_CONVERGED and near
+
+
+def tolerance_px(model: CellModel, wanted: float | str) -> float:
+    """The tolerance in px per axis; ``auto`` follows the scatter of arrivals.
+
+    Raises UsageError for one below twice the scatter, which most arrivals would miss by chance.
+    """
+    scatter = arrival_scatter(model)
+    if wanted == "auto":
+        return max(LEAST_AUTO_PX, AUTO_TOLERANCE * scatter)
+    tolerance = float(wanted)
+    if tolerance < 2 * scatter:
+        raise UsageError(
+            f"procedure.tolerance_px: {tolerance:g} px is below twice the scatter of arrivals, {2 * scatter:.3f} px, "
+            f"that joint_sigma_mrad of '{model.passive.name}' implies; allow more or write auto"
+        )
+    return tolerance
+
+
+def largest_alignment_error(model: CellModel, tolerance: float) -> float:
+    """``e_c_max`` in m at the largest distance (paper, eqs. 17 and 18)."""
+    focal = model.intrinsics.matrix[[0, 1], [0, 1]]
+    return float(np.linalg.norm(tolerance * model.distance[1] / focal))
+
+
+@dataclass
+class AxisTrack:
+    """Where the optical axis runs in P: as believed, corrected by the points already aligned with it.
+
+    T_P_E: (4, 4) camera as believed; direction_sigma: rad per axis; point_sigma: m per axis of one aligned point.
+    """
+
+    T_P_E: Array
+    direction_sigma: float
+    point_sigma: float
+    _points: list[Array] = field(default_factory=list)
+
+    def add(self, point_on_axis: Array) -> None:
+        """Learn from a point (3,) in P that lies on the axis."""
+        self._points.append(inverse(self.T_P_E)[:3, :3] @ (point_on_axis - self.T_P_E[:3, 3]))
+
+    def at(self, distance: float) -> Array:
+        """The point (3,) in P on the axis at a distance (m) from the camera.
+
+        A straight line through the points, least squares, its direction held to the believed one by that
+        direction's uncertainty; through one point it runs parallel to the belief.
+        """
+        lateral = np.zeros(2)
+        if self._points:
+            points = np.array(self._points)
+            depth = points[:, 2] - points[:, 2].mean()
+            stiffness = (self.point_sigma / max(self.direction_sigma, 1e-9)) ** 2
+            slope = depth @ points[:, :2] / (depth @ depth + stiffness)
+            lateral = points[:, :2].mean(axis=0) + slope * (distance - points[:, 2].mean())
+        return np.asarray(self.T_P_E[:3, 3] + self.T_P_E[:3, :3] @ [*lateral, distance])
+
+
+class Servo:
+    """The image Jacobian of one constraint: how the feature moves across the axis when the target is shifted.
+
+    In metres on both sides (offset times depth over focal length), so it keeps its value along the axis: the
+    identity if the camera's orientation were known exactly.
+    """
+
+    def __init__(self, jacobian: Array) -> None:
+        self._first = jacobian
+        self.jacobian = jacobian.copy()
+
+    def step(self, lateral: Array) -> Array:
+        """The shift (2,) in m in the believed camera plane that takes away an offset (2,) in m."""
+        if np.linalg.cond(self.jacobian) > _WORST_CONDITION:
+            self.jacobian = self._first.copy()
+        shift = -np.linalg.solve(self.jacobian, lateral)
+        return np.asarray(shift * min(1.0, LONGEST_STEP / max(float(np.linalg.norm(shift)), 1e-12)))
+
+    def learn(self, shift: Array, change: Array) -> None:
+        """Broyden's update by a shift (2,) and the change (2,) of the offset that it brought, both in m."""
+        length = float(shift @ shift)
+        if length > 0.0:
+            self.jacobian = self.jacobian + np.outer(change - self.jacobian @ shift, shift) / length
+
+
+class Aligner:
+    """Aligns points of one constraint."""
+
+    def __init__(self, model: CellModel, belief: Belief, ways: WayFinder, detector: Detector, tolerance: float) -> None:
+        self._model, self._belief, self._ways = model, belief, ways
+        self._detector, self._tolerance = detector, tolerance
+        self._servo: Servo | None = None
+
+    @property
+    def jacobian(self) -> Array | None:
+        """(2, 2), None before the first correction."""
+        return None if self._servo is None else self._servo.jacobian
+
+    def go_on_with(self, jacobian: Array | None) -> None:
+        """Use the Jacobian (2, 2) that an earlier position of this constraint ended with."""
+        if self._servo is None and jacobian is not None:
+            self._servo = Servo(jacobian)
+
+    def align(self, active: Joints, passive: Joints, T_P_T: Array, camera: Array) -> Procedure[Alignment]:
+        """Bring the target from where it is to ``T_P_T`` and from there onto the axis.
+
+        active: the constraint's joint angles; passive: joint angles near the goal; camera: believed T_P_E.
+        """
+        goal, near = T_P_T.copy(), passive
+        frames = 0
+        last: tuple[Array, Array, Array] | None = None  # shift, lateral and offset of the picture before
+        reply = Alignment(Outcome.NOT_CONVERGED, 0, None)
+        while frames < MOST_FRAMES:
+            joints = self._reach(goal, near)
+            blocked = "not reached by the passive arm" if joints is None else (yield from self._go(active, joints))
+            if joints is None or blocked:
+                return Alignment(Outcome.OUT_OF_REACH, frames, reply.offset, blocked)
+            near = joints
+            sighting = yield from look()
+            frames += 1
+            seen = self._detect(sighting)
+            if isinstance(seen, Missed):
+                return Alignment(Outcome.LOST, frames, reply.offset, f"{seen.reason}: {seen.detail}", sighting)
+            offset = seen.feature - self._model.intrinsics.principal_point
+            if np.all(np.abs(offset) <= self._tolerance):
+                return Alignment(Outcome.ALIGNED, frames, offset, "", sighting, seen)
+            reply = Alignment(Outcome.NOT_CONVERGED, frames, offset, f"{MOST_FRAMES} pictures", sighting, seen)
+            lateral, servo = self._lateral(sighting, seen)
+            if last is not None and np.linalg.norm(offset - last[2]) >= LEAST_CHANGE_PX:
+                servo.learn(last[0], lateral - last[1])
+            shift = servo.step(lateral)
+            last = (shift, lateral, offset)
+            goal[:3, 3] += camera[:3, :2] @ shift
+        return reply
+
+    def _reach(self, T_P_T: Array, near: Joints) -> Joints | None:
+        arm = self._model.passive
+        q, reached = arm.chain.inverse(T_P_T @ inverse(self._model.T_F_T), [near], arm.lower, arm.upper)
+        return tuple(map(float, q[0])) if reached[0] else None
+
+    def _go(self, active: Joints, passive: Joints) -> Procedure[str]:
+        """Move both arms there; returns why it is not possible, or nothing."""
+        readings = yield from read()
+        here = Posture(
+            readings.active.commanded or readings.active.state.positions,
+            readings.passive.commanded or readings.passive.state.positions,
+        )
+        way = self._ways.find(here, Posture(active, passive))
+        if way is None:
+            return "no clear way"
+        for leg in way:
+            yield from move(leg.arm, leg.goal)
+        return ""
+
+    def _detect(self, sighting: Sighting) -> Detection | Missed:
+        predicted = self._model.predict_corners(sighting.active, sighting.passive, self._belief)
+        return self._detector.detect(sighting.frame.image, predicted if np.all(np.isfinite(predicted)) else None)
+
+    def _lateral(self, sighting: Sighting, seen: Detection) -> tuple[Array, Servo]:
+        """The feature's offset across the axis (2,) in m, and the constraint's servo."""
+        model = self._model
+        poses = [T for T, _ in board_poses(seen.corners, model.board, model.intrinsics)]
+        T_P_E = model.camera_in_passive(sighting.active, self._belief)
+        T_P_T = model.target_in_passive(sighting.passive)
+        predicted = inverse(T_P_E) @ T_P_T
+        T_E_T = min(poses, key=lambda T: float(rotation_angle(T[:3, :3], predicted[:3, :3])))
+        if self._servo is None:
+            self._servo = Servo(self._first_jacobian(sighting, T_E_T, T_P_T, T_P_E))
+        intrinsics = model.intrinsics
+        ray = undistort(seen.feature, intrinsics.matrix, intrinsics.distortion)
+        return np.asarray(ray * T_E_T[2, 3]), self._servo
+
+    def _first_jacobian(self, sighting: Sighting, T_E_T: Array, T_P_T: Array, T_P_E: Array) -> Array:
+        """From the board's pose, unless the camera's orientation is known better than one picture tells it."""
+        sigma = self._belief.rotation_sigma(self._model.active.chain.forward(sighting.active))
+        if sigma < _POSE_ROTATION_SIGMA:
+            return np.eye(2)
+        R_E_P = T_E_T[:3, :3] @ T_P_T[:3, :3].T
+        return np.asarray((R_E_P @ T_P_E[:3, :2])[:2])
+
+
+def point_on_axis(model: CellModel, passive: Joints, feature: Array, T_P_E: Array) -> Array:
+    """The point (3,) in P on the axis beside the feature: where the joints say it is, less its offset in the image.
+
+    feature: (2,) px.
+    """
+    point = model.target_in_passive(passive)[:3, 3]
+    depth = (inverse(T_P_E)[:3, :3] @ (point - T_P_E[:3, 3]))[2]
+    ray = undistort(feature, model.intrinsics.matrix, model.intrinsics.distortion)
+    return np.asarray(point - T_P_E[:3, :2] @ (ray * depth))
+
+
+def target_on_axis(model: CellModel, track: AxisTrack, passive: Joints, distance: float) -> Array:
+    """``T_P_T`` (4, 4) with the planned orientation of the target, its feature point on the axis at a distance."""
+    return transform(model.target_in_passive(passive)[:3, :3], track.at(distance))

@@ -1,0 +1,357 @@
+"""The calibration procedure: first look, plan, and for each constraint align and capture at every position.
+
+A generator of steps; it touches no device and knows no file. It plans with a belief that every finished constraint
+improves; estimation and verification work on the captures alone and start from the nominal.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from dualcal_hal.config import CellConfig, ProcedureConfig
+from dualcal_hal.errors import NoPlan
+from dualcal_hal.robot import Joints
+from dualcal_hal.session.captures import CaptureRecord, Captures
+from dualcal_hal.session.journal import Journal, StepKey
+from dualcal_hal.transforms import Array
+from procedures.alignment import Aligner, Alignment, AxisTrack, Outcome, point_on_axis, target_on_axis, tolerance_px
+from procedures.detection import Detection, Detector
+from procedures.events import BeliefRefined, ConstraintDone, ConstraintGivenUp, LookTaken, PlanReady, PointDone
+from procedures.planning.belief import Belief
+from procedures.planning.first_look import find_stand_off, look_postures
+from procedures.planning.model import CellModel, Posture
+from procedures.planning.plan import Plan, PlannedConstraint
+from procedures.planning.poses import ROOM, PosePlanner, Request
+from procedures.planning.refine import WORST_FIT, View, arrival_scatter, refine
+from procedures.planning.ways import WayFinder
+from procedures.steps import Believe, KeepDocument, KeepImage, Procedure, look, move, read, task, tell
+
+LEAST_LOOKS = 3
+_TRIES_A_LOOK = 20
+_REPLACEMENTS = 3
+"""Constraints that may be given up, for each that is wanted."""
+
+
+@dataclass(frozen=True)
+class StandOffRecord:
+    """Where the looks are taken from."""
+
+    posture: Posture
+
+    def to_record(self) -> dict[str, Any]:
+        return {"active_rad": self.posture.active, "passive_rad": self.posture.passive}
+
+    @classmethod
+    def from_record(cls, record: dict[str, Any]) -> Self:
+        return cls(Posture(tuple(record["active_rad"]), tuple(record["passive_rad"])))
+
+
+@dataclass(frozen=True, eq=False)
+class LookRecord:
+    """What a look saw, or why it saw nothing."""
+
+    view: View | None
+    reason: str
+
+    def to_record(self) -> dict[str, Any]:
+        return {"view": _view_record(self.view), "reason": self.reason}
+
+    @classmethod
+    def from_record(cls, record: dict[str, Any]) -> Self:
+        return cls(_view_from(record["view"]), record["reason"])
+
+
+@dataclass(frozen=True, eq=False)
+class PointRecord:
+    """What came of one position: a capture, or the outcome and reason it was given up for.
+
+    ``view`` is what the last picture showed, captured or not; ``servo`` (2, 2) the Jacobian to go on with.
+    """
+
+    outcome: str
+    frames: int
+    reason: str
+    offset_px: tuple[float, float] | None
+    view: View | None
+    capture: CaptureRecord | None
+    servo: Array | None
+
+    def to_record(self) -> dict[str, Any]:
+        return {
+            "outcome": self.outcome,
+            "frames": self.frames,
+            "reason": self.reason,
+            "offset_px": self.offset_px,
+            "view": _view_record(self.view),
+            "capture": None if self.capture is None else self.capture.to_record(),
+            "servo": None if self.servo is None else self.servo.tolist(),
+        }
+
+    @classmethod
+    def from_record(cls, record: dict[str, Any]) -> Self:
+        capture, servo, offset = record["capture"], record["servo"], record["offset_px"]
+        return cls(
+            record["outcome"],
+            record["frames"],
+            record["reason"],
+            None if offset is None else (offset[0], offset[1]),
+            _view_from(record["view"]),
+            None if capture is None else CaptureRecord.from_record(capture),
+            None if servo is None else np.array(servo),
+        )
+
+
+class Calibration:
+    """One run of the procedure on one cell; :meth:`steps` is what the engine runs."""
+
+    def __init__(self, cell: CellConfig, model: CellModel) -> None:
+        self._procedure = cell.procedure
+        self._model = model
+        self._detector = Detector(model.board, model.intrinsics.size)
+        self._tolerance = tolerance_px(model, cell.procedure.tolerance_px)
+        self._belief = model.nominal
+        self._views: list[View] = []
+        self._retreats: list[Posture] = [model.home]
+        self._ways = WayFinder(model, self._belief, self._retreats)
+        self._arrivals = itertools.count()
+
+    def steps(self) -> Procedure[None]:
+        """First look, plan, calibration, verification, home."""
+        yield from self._adopt(self._belief)
+        if self._procedure.first_looks:
+            yield from self._first_look()
+        wanted = requests_of(self._procedure)
+        planned = yield from task(StepKey("plan", None, None, "plan"), lambda: self._plan(wanted, "plan"), Plan)
+        yield KeepDocument("plan.json", planned.to_record())
+        yield from tell(PlanReady(planned))
+        for request in wanted:
+            yield from self._constraints(request, list(planned.of(request.use)))
+        yield from self._go_home()
+
+    # -- first look ---------------------------------------------------------------------------------------------
+
+    def _first_look(self) -> Procedure[None]:
+        stand_off = yield from task(StepKey("looks", None, None, "stand-off"), self._stand_off, StandOffRecord)
+        self._retreats.insert(0, stand_off.posture)
+        yield from self._adopt(self._belief)
+        count = self._procedure.first_looks
+        reasons = []
+        for number in range(count):
+            key = StepKey("looks", f"looks/{number}", None, "look")
+            record = yield from task(key, lambda n=number: self._look(stand_off.posture, n), LookRecord)  # type: ignore[misc]
+            yield from tell(LookTaken(number, count, record.view is not None, record.reason))
+            if record.view is not None:
+                self._views.append(record.view)
+                yield from self._refine()
+            else:
+                reasons.append(f"look {number + 1}: {record.reason}")
+                if number == 0:
+                    break
+        if len(self._views) < LEAST_LOOKS:
+            raise NoPlan(
+                f"first look: {len(self._views)} of {count} looks found the target, {LEAST_LOOKS} are needed "
+                f"({'; '.join(reasons)}); check the nominal transforms, the lighting and that nothing hides the target"
+            )
+
+    def _stand_off(self) -> Procedure[StandOffRecord]:
+        here = yield from self._here()
+        found = find_stand_off(self._model, self._belief, self._ways, here, self._procedure.seed)
+        return StandOffRecord(found.posture)
+
+    def _look(self, stand_off: Posture, number: int) -> Procedure[LookRecord]:
+        reason = "no posture for it keeps clear and shows the target"
+        postures = look_postures(self._model, self._belief, self._ways, stand_off, number)
+        for posture in itertools.islice(postures, _TRIES_A_LOOK):
+            if not (yield from self._go(posture)):
+                continue
+            sighting = yield from look()
+            predicted = self._model.predict_corners(sighting.active, sighting.passive, self._belief)
+            usable = predicted if np.all(np.isfinite(predicted)) else None
+            seen = self._detector.detect(sighting.frame.image, usable)
+            if isinstance(seen, Detection):
+                yield KeepImage(f"looks/{number}", sighting.frame.image)
+                return LookRecord(View(sighting.active, sighting.passive, seen.corners), "")
+            reason = f"{seen.reason}: {seen.detail}"
+        return LookRecord(None, reason)
+
+    # -- constraints --------------------------------------------------------------------------------------------
+
+    def _plan(self, requests: list[Request], purpose: str) -> Procedure[Plan]:
+        here = yield from self._here()
+        seed = [self._procedure.seed, *purpose.encode()]
+        planner = PosePlanner(self._model, self._belief, self._ways, seed)
+        return planner.plan(requests, here, provisional=False)
+
+    def _constraints(self, request: Request, queue: list[PlannedConstraint]) -> Procedure[None]:
+        """Capture as many constraints as requested; one that fails is replaced by another."""
+        finished, given_up, next_number = 0, 0, len(queue)
+        while finished < request.constraints:
+            if not queue or self._is_outdated(queue[0]):
+                missing = Request(request.use, request.constraints - finished, request.positions, next_number)
+                key = StepKey("plan", f"{request.use}/{next_number:02d}", None, "replacement")
+                again = yield from task(key, lambda r=missing, k=key: self._plan([r], k.constraint), Plan)  # type: ignore[misc]
+                queue = list(again.constraints)
+                next_number += len(queue)
+            constraint = queue.pop(0)
+            failure = yield from self._constraint(constraint)
+            if failure is None:
+                finished += 1
+                yield from tell(ConstraintDone(request.use, constraint.name, finished, request.constraints))
+            else:
+                given_up += 1
+                yield from tell(ConstraintGivenUp(constraint.name, failure))
+                if given_up > _REPLACEMENTS * request.constraints:
+                    raise NoPlan(f"{given_up} {request.use} constraints were given up, the last one because: {failure}")
+            if self._views:
+                yield from self._refine()
+
+    def _constraint(self, constraint: PlannedConstraint) -> Procedure[str | None]:
+        """Align and capture at all positions; returns why the constraint is given up, or None."""
+        model, belief = self._model, self._belief
+        T_P_E = model.camera_in_passive(constraint.active, belief)
+        track = self._track(constraint, T_P_E)
+        aligner = Aligner(model, belief, self._ways, self._detector, self._tolerance)
+        arrival = next(self._arrivals)
+        for i, planned in enumerate(constraint.positions):
+            T_P_T = target_on_axis(model, track, planned.passive, planned.distance)
+            key = StepKey(constraint.use, constraint.name, i, "point")
+
+            def body(i: int = i, near: Joints = planned.passive, goal: Array = T_P_T) -> Procedure[PointRecord]:
+                alignment = yield from aligner.align(constraint.active, near, goal, T_P_E)
+                return (yield from self._captured(constraint, i, arrival, alignment, aligner))
+
+            point = yield from task(key, body, PointRecord)
+            yield from tell(_point_done(constraint, i, point))
+            if point.view is not None:
+                self._views.append(point.view)
+            if point.capture is None:
+                return f"position {i + 1}: {point.outcome}, {point.reason}"
+            aligner.go_on_with(point.servo)
+            track.add(point_on_axis(model, point.capture.passive_joints, np.array(point.capture.feature), T_P_E))
+        return None
+
+    def _captured(
+        self, constraint: PlannedConstraint, position: int, arrival: int, alignment: Alignment, aligner: Aligner
+    ) -> Procedure[PointRecord]:
+        sighting, seen = alignment.sighting, alignment.detection
+        view = None if sighting is None or seen is None else View(sighting.active, sighting.passive, seen.corners)
+        capture = None
+        if alignment.captured and sighting is not None and seen is not None:
+            name = f"{constraint.name}/{position}"
+            capture = CaptureRecord(
+                id=name,
+                use=constraint.use,
+                constraint=constraint.name,
+                position=position,
+                active_arrival=arrival,
+                active_joints=sighting.active,
+                passive_joints=sighting.passive,
+                feature=tuple(map(float, seen.feature)),
+                corners=tuple(tuple(map(float, corner)) for corner in seen.corners),
+                image_size=self._model.intrinsics.size,
+                aligned=alignment.outcome is Outcome.ALIGNED,
+                order_known=seen.order_known,
+            )
+            yield KeepImage(name, sighting.frame.image)
+        offset = None if alignment.offset is None else (float(alignment.offset[0]), float(alignment.offset[1]))
+        outcome, frames, reason = str(alignment.outcome), alignment.frames, alignment.reason
+        return PointRecord(outcome, frames, reason, offset, view, capture, aligner.jacobian)
+
+    def _track(self, constraint: PlannedConstraint, T_P_E: Array) -> AxisTrack:
+        model = self._model
+        believed = self._belief.rotation_sigma(model.active.chain.forward(constraint.active))
+        arrival = model.active.joint_sigma * np.sqrt(model.active.chain.joints)
+        focal = float(np.mean(model.intrinsics.matrix[[0, 1], [0, 1]]))
+        point_sigma = max(arrival_scatter(model), 0.01) / focal * float(np.mean(model.distance))
+        return AxisTrack(T_P_E, float(np.hypot(believed, arrival)), point_sigma)
+
+    def _is_outdated(self, constraint: PlannedConstraint) -> bool:
+        """Whether the belief has moved the axis by more than the room that the plan left for alignment."""
+        model = self._model
+        camera = model.camera_in_passive(constraint.active, self._belief)
+        planned = model.target_in_passive([position.passive for position in constraint.positions])[:, :3, 3]
+        in_camera = (planned - camera[:3, 3]) @ camera[:3, :3]
+        return bool(np.any(np.linalg.norm(in_camera[:, :2], axis=1) > ROOM))
+
+    # -- both ---------------------------------------------------------------------------------------------------
+
+    def _refine(self) -> Procedure[None]:
+        belief, rms = refine(self._model, self._views)
+        if rms > WORST_FIT:
+            raise NoPlan(
+                f"what the camera saw does not fit this cell: {rms:.1f} px rms over {len(self._views)} views; check "
+                "square_mm, target_mount, the camera's matrix, and order, sign and zero of the joints"
+            )
+        yield from self._adopt(belief)
+        yield from tell(BeliefRefined(len(self._views), rms))
+
+    def _adopt(self, belief: Belief) -> Procedure[None]:
+        self._belief = belief
+        self._ways = WayFinder(self._model, belief, self._retreats)
+        yield Believe(belief.T_P_A, belief.T_H_E)
+
+    def _here(self) -> Procedure[Posture]:
+        readings = yield from read()
+        return Posture(
+            readings.active.commanded or readings.active.state.positions,
+            readings.passive.commanded or readings.passive.state.positions,
+        )
+
+    def _go(self, goal: Posture) -> Procedure[bool]:
+        """Move both arms to a posture; says whether there was a clear way."""
+        way = self._ways.find((yield from self._here()), goal)
+        for leg in way or ():
+            yield from move(leg.arm, leg.goal)
+        return way is not None
+
+    def _go_home(self) -> Procedure[None]:
+        if not (yield from self._go(self._model.home)):
+            raise NoPlan("no clear way home from where the arms stand; jog them apart")
+
+
+def requests_of(procedure: ProcedureConfig) -> list[Request]:
+    """The constraints that a cell file asks for; verification may be none."""
+    verification = procedure.verification
+    requests = [
+        Request("calibration", procedure.constraints, procedure.positions),
+        Request("verification", verification.constraints, verification.positions),
+    ]
+    return [request for request in requests if request.constraints]
+
+
+def captures_of(journal: Journal, cell_sha256: str, started: str) -> Captures:
+    """The captures of a run so far, in the order taken; without those of constraints that were given up."""
+    points = [(key, PointRecord.from_record(result)) for key, result in journal.results() if key.kind == "point"]
+    given_up = {key.constraint for key, point in points if point.capture is None}
+    captures = [point.capture for key, point in points if point.capture and key.constraint not in given_up]
+    return Captures(cell_sha256, started, tuple(captures))
+
+
+def _point_done(constraint: PlannedConstraint, position: int, point: PointRecord) -> PointDone:
+    return PointDone(
+        constraint.use,
+        constraint.name,
+        position,
+        len(constraint.positions),
+        point.outcome,
+        point.capture is not None,
+        point.frames,
+        point.offset_px,
+        point.reason,
+    )
+
+
+def _view_record(view: View | None) -> dict[str, Any] | None:
+    if view is None:
+        return None
+    return {"active_rad": view.active, "passive_rad": view.passive, "corners_px": view.corners.tolist()}
+
+
+def _view_from(record: dict[str, Any] | None) -> View | None:
+    if record is None:
+        return None
+    return View(tuple(record["active_rad"]), tuple(record["passive_rad"]), np.array(record["corners_px"]))

@@ -1,0 +1,6 @@
+"""The checkerboard in images: its corners, and the board's poses that explain them."""
+
+from procedures.detection.detector import Detection, Detector, Miss, Missed
+from procedures.detection.pose import board_poses
+
+__all__ = ["Detection", "Detector", "Miss", "Missed", "board_poses"]

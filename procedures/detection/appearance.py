@@ -1,0 +1,59 @@
+"""What a checkerboard looks like: black and white in turn, with edges of some sharpness."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from dualcal_hal.camera import Image
+from dualcal_hal.transforms import Array
+
+_TO_QUADRANT = 0.3
+"""Squares from a corner to where its four squares are looked at."""
+
+
+def sample(image: Image, pixels: Array) -> Array:
+    """Grey values (...) at ``pixels`` (..., 2), bilinear; the image's edge goes on outside."""
+    x, y = pixels[..., 0], pixels[..., 1]
+    return np.asarray(map_coordinates(image, [y, x], order=1, mode="nearest", output=float))
+
+
+def contrast(image: Image, homography: Array, lattice: Array) -> Array:
+    """White minus black around each lattice point, in grey levels.
+
+    homography: (3, 3) from lattice coordinates (column, row) to px; lattice: (n, 2). The result (n,) has one
+    sign all over a checkerboard, halves at its rim and vanishes in expectation off it.
+    """
+    quadrants = _TO_QUADRANT * np.array([[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]])
+    places = (lattice[:, None] + quadrants).reshape(-1, 1, 2)
+    pixels = np.asarray(cv2.perspectiveTransform(places, homography), dtype=float)
+    grey = sample(image, pixels.reshape(-1, 4, 2))
+    parity = 1.0 - 2.0 * (np.rint(lattice).sum(axis=1) % 2)
+    return np.asarray(parity * (grey @ np.array([0.5, 0.5, -0.5, -0.5])))
+
+
+def edge_blur(image: Image, grid: Array, spacing: float) -> float:
+    """Gaussian sigma in px that makes edges as wide as those between the corners ``grid`` (rows, columns, 2).
+
+    From height and steepest slope of the mean profile across each edge; the median of the edges of one
+    direction, for the direction that is blurred more (motion blurs one). It includes about 0.5 px of the pixels
+    themselves; blur beyond about a third of ``spacing``, the corners' least distance in px, is underestimated.
+    """
+    along_rows = _edge_widths(image, grid[:, :-1].reshape(-1, 2), grid[:, 1:].reshape(-1, 2), spacing)
+    along_columns = _edge_widths(image, grid[:-1].reshape(-1, 2), grid[1:].reshape(-1, 2), spacing)
+    return float(max(np.median(along_rows), np.median(along_columns)))
+
+
+def _edge_widths(image: Image, start: Array, end: Array, spacing: float) -> Array:
+    """Gaussian sigma (n,) px across the straight edges from ``start`` to ``end`` (n, 2) px."""
+    half = np.clip(np.floor(0.4 * spacing), 2.0, 10.0)
+    across = np.arange(-half, half + 1.0)
+    along = np.linspace(0.3, 0.7, 9)
+    edge = end - start
+    normal = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    on_edge = start[:, None] + along[:, None] * edge[:, None]
+    profile = sample(image, on_edge[:, :, None] + across[:, None] * normal[:, None, None]).mean(axis=1)
+    height = np.abs(profile[:, -1] - profile[:, 0])
+    slope = np.abs(np.diff(profile, axis=1)).max(axis=1)
+    return np.asarray(height / (np.sqrt(2.0 * np.pi) * np.maximum(slope, np.finfo(float).tiny)))

@@ -1,0 +1,193 @@
+"""The engine: the only code that touches devices, waits, records and reports."""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import Any, TypeVar
+
+import numpy as np
+
+from dualcal_hal.cell import Arm, Cell
+from dualcal_hal.errors import ArmMoved, DualcalError, Interrupted
+from dualcal_hal.guard import READ_TIMEOUT, Placement
+from dualcal_hal.robot import JointPath, Joints, Motion, RobotState
+from dualcal_hal.session.folder import Session
+from procedures.observers import Observers
+from procedures.planning.belief import Belief
+from procedures.planning.model import CellModel
+from procedures.steps import (
+    ArmReading,
+    Believe,
+    KeepDocument,
+    KeepImage,
+    Look,
+    Move,
+    Procedure,
+    Read,
+    Readings,
+    Sighting,
+    Task,
+    Tell,
+)
+
+T = TypeVar("T")
+
+GRAB_TIMEOUT = 2.0
+LATE_FACTOR, LATE_MARGIN = 2.0, 5.0
+"""A motion is late after this factor of the time it needs at its speed, and this many seconds more."""
+
+
+class Engine:
+    """Runs a procedure's steps on an open cell, and stops every arm it has moved on any exit."""
+
+    def __init__(self, cell: Cell, model: CellModel, session: Session, observers: Observers) -> None:
+        self._cell = cell
+        self._model = model
+        self._session = session
+        self._observers = observers
+        self._wake = threading.Event()
+        self._abort_reason: str | None = None
+        self._commanded: dict[str, Joints] = {}
+        self._still: dict[str, float] = {
+            arm.robot.name: _reading_noise(sigma)
+            for arm, sigma in ((cell.active, model.active.encoder_sigma), (cell.passive, model.passive.encoder_sigma))
+        }
+
+    def run(self, procedure: Procedure[T]) -> T:
+        """The procedure's return value; Interrupted after :meth:`abort`; device errors as they are."""
+        cause = "the run has ended"
+        try:
+            return self._drive(procedure)
+        except BaseException as error:
+            cause = str(error) or type(error).__name__
+            raise
+        finally:
+            self._stop_all(cause)
+
+    def abort(self, reason: str) -> None:
+        """End the run at once: from any thread or a signal's handler, any number of times."""
+        self._abort_reason = reason
+        self._wake.set()
+
+    def _drive(self, procedure: Procedure[T]) -> T:
+        reply: Any = None
+        error: DualcalError | None = None
+        try:
+            while True:
+                step = procedure.send(reply) if error is None else procedure.throw(error)
+                reply, error = None, None
+                try:
+                    self._raise_if_aborted()
+                    reply = self._execute(step)
+                except DualcalError as caught:
+                    error = caught
+        except StopIteration as end:
+            result: T = end.value
+            return result
+        finally:
+            procedure.close()
+
+    def _execute(self, step: object) -> Any:
+        match step:
+            case Read():
+                return Readings(self._reading(self._cell.active), self._reading(self._cell.passive))
+            case Move(arm, goal):
+                return self._move(self._cell.arm(arm), goal)
+            case Look():
+                return self._look()
+            case Task():
+                return self._task(step)
+            case Tell(event):
+                return self._observers.tell(event)
+            case KeepImage(name, image):
+                return self._session.write_image(name, image)
+            case KeepDocument(file_name, document):
+                return self._session.write_document(file_name, document)
+            case Believe(T_P_A, T_H_E):
+                belief = Belief(T_P_A, T_H_E, np.zeros((12, 12)), "")
+                return self._cell.guard.place(Placement(self._model.geometry(belief), T_P_A))
+        raise TypeError(f"{step!r} is no step")
+
+    def _task(self, task: Task) -> Any:
+        finished = self._session.journal.result(task.key)
+        if finished is not None:
+            return task.result.from_record(finished)
+        result = self._drive(task.body())
+        self._session.journal.append(task.key, result.to_record())
+        return result
+
+    def _reading(self, arm: Arm) -> ArmReading:
+        return ArmReading(arm.robot.read(READ_TIMEOUT), self._commanded.get(arm.robot.name))
+
+    def _move(self, arm: Arm, goal: Joints) -> RobotState:
+        limits = arm.limits
+        path = JointPath((goal,), tuple(map(float, limits.speed)), tuple(map(float, limits.acceleration)))
+        start = arm.robot.read(READ_TIMEOUT)
+        needed = np.abs(np.subtract(goal, start.positions)) / limits.speed + limits.speed / limits.acceleration
+        # Known as moved before the command leaves: a failure from here on finds the arm among those to stop.
+        self._commanded.pop(arm.robot.name, None)
+        self._commanded[arm.robot.name] = goal
+        state = self._wait(arm.robot.start(path), LATE_FACTOR * float(np.max(needed)) + LATE_MARGIN)
+        return state
+
+    def _wait(self, motion: Motion, timeout: float) -> RobotState:
+        """The one place where the engine waits; wakes at once when the motion ends or the run is aborted."""
+        self._wake.clear()
+        motion.on_end(self._wake.set)
+        self._raise_if_aborted()
+        self._cell.clock.wait(self._wake, self._cell.clock.now() + timeout)
+        self._raise_if_aborted()
+        return motion.result(timeout)
+
+    def _look(self) -> Sighting:
+        arms = (self._cell.active, self._cell.passive)
+        before = [arm.robot.read(READ_TIMEOUT) for arm in arms]
+        frame = self._cell.camera.grab(self._cell.clock.now(), GRAB_TIMEOUT)
+        after = [arm.robot.read(READ_TIMEOUT) for arm in arms]
+        joints = []
+        for arm, first, last in zip(arms, before, after, strict=True):
+            moved = float(np.max(np.abs(np.subtract(last.positions, first.positions))))
+            if moved > self._still[arm.robot.name]:
+                raise ArmMoved(
+                    arm.robot.name,
+                    "take a picture",
+                    f"a joint moved by {np.rad2deg(moved):.4f} deg during the exposure",
+                    "check what moves or shakes the arm",
+                )
+            joints.append(tuple(map(float, np.mean([first.positions, last.positions], axis=0))))
+        return Sighting(frame, *joints)
+
+    def _raise_if_aborted(self) -> None:
+        if self._abort_reason is not None:
+            raise Interrupted(self._abort_reason)
+
+    def _stop_all(self, cause: str) -> None:
+        """Stop every arm that was moved, each whatever the others' stops do."""
+        errors: list[Exception] = []
+        for name in self._commanded:
+            try:
+                result = self._cell.arm(name).robot.stop(cause)
+            except Exception as error:  # noqa: BLE001 - the other arm must still be stopped
+                errors.append(error)
+                continue
+            if not result.confirmed:
+                self._observers.tell(StopUnconfirmed(name, result.detail))
+        if errors:
+            raise ExceptionGroup("arms that could not be stopped", errors)
+
+
+class StopUnconfirmed:
+    """An arm did not confirm that it stands still."""
+
+    def __init__(self, arm: str, detail: str) -> None:
+        self.arm = arm
+        self.detail = detail
+
+    def __str__(self) -> str:
+        return f"{self.arm}: the stop is not confirmed: {self.detail}; use the emergency stop if it moves"
+
+
+def _reading_noise(encoder_sigma: float) -> float:
+    """How far (rad) two readings of an arm that stands may differ: eight sigma of a difference, at least 0.1 mrad."""
+    return max(1e-4, 8 * math.sqrt(2) * encoder_sigma)

@@ -1,0 +1,153 @@
+"""The paper's two-step estimator: rotations by iteration, then translations by SVD (section 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dualcal_hal.transforms import Array, nearest_rotation, rotation_angle, smallest_rotation, transform
+from procedures.estimation.degenerate import Degenerate
+from procedures.estimation.line import fit_line
+from procedures.estimation.rotation import Iteration, estimate_rotation, rotation_singular_values
+from procedures.estimation.translation import RANK, estimate_translation
+
+FEWEST_CONSTRAINTS = 3
+
+DEGENERATE = 0.003
+WEAK = 0.1
+
+# Only to put the reason into words; what is refused is decided by the singular values.
+_SAME_DIRECTION = 0.01  # rad
+
+
+@dataclass(frozen=True)
+class Unobservable:
+    """What aligned points cannot show: a unit 6-vector [translation; rotation] in the child frame of ``of``."""
+
+    what: str
+    direction: tuple[float, ...]
+    of: str
+
+
+_UNOBSERVABLE = (
+    Unobservable("shift along the optical axis", (0.0, 0.0, 1.0, 0.0, 0.0, 0.0), "camera_in_active_flange"),
+    Unobservable("roll about the optical axis", (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "camera_in_active_flange"),
+)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the paper's method finds.
+
+    T_P_A, T_H_E (4, 4); optical_axis: z_H_E (3,); unobservable: the directions of T_H_E that keep their nominal
+    value; rotation_singular_values (5,) and translation_singular_values (6,): of the two linearised steps;
+    conditioning: smallest over largest singular value, the lower of both steps; warnings in words.
+    """
+
+    T_P_A: Array
+    T_H_E: Array
+    optical_axis: Array
+    iterations: tuple[Iteration, ...]
+    unobservable: tuple[Unobservable, ...]
+    rotation_singular_values: Array
+    translation_singular_values: Array
+    conditioning: float
+    warnings: tuple[str, ...]
+
+
+def estimate(
+    T_A_H: ArrayLike,
+    T_P_T: ArrayLike,
+    constraints: Sequence[Hashable],
+    nominal_T_P_A: ArrayLike,
+    nominal_T_H_E: ArrayLike,
+) -> Estimate:
+    """Estimate T_P_A and T_H_E from captures with the feature point on the optical axis.
+
+    T_A_H, T_P_T: active flange and target of each capture (k, 4, 4), m; constraints: the name of each capture's
+    constraint (k); nominal transforms (4, 4). Raises Degenerate for fewer than three constraints, fewer than
+    three separate positions in one, and active flanges not turned about two axes.
+    """
+    T_A_H, T_P_T = np.asarray(T_A_H, dtype=float), np.asarray(T_P_T, dtype=float)
+    T_P_A, T_H_E = np.asarray(nominal_T_P_A, dtype=float), np.asarray(nominal_T_H_E, dtype=float)
+    members = _members(constraints)
+    flanges = np.stack([nearest_rotation(T_A_H[m, :3, :3].mean(axis=0)) for m in members.values()])
+    directions = _directions(members, T_P_T[:, :3, 3], T_P_A[:3, :3] @ flanges @ T_H_E[:3, 2])
+    _refuse_degenerate(rotation_singular_values(flanges, T_H_E[:3, 2]), flanges, directions)
+
+    rotation = estimate_rotation(directions, flanges, T_P_A[:3, :3], T_H_E[:3, 2])
+    rotation_values = rotation_singular_values(flanges, rotation.z_H_E)
+    _refuse_degenerate(rotation_values, flanges, directions)
+
+    of_capture = np.empty((len(T_A_H), 3))
+    for m, direction in zip(members.values(), directions, strict=True):
+        of_capture[m] = direction
+    translation = estimate_translation(
+        of_capture, T_A_H, T_P_T[:, :3, 3], rotation.R_P_A, rotation.z_H_E, T_P_A[:3, 3], T_H_E[:3, 3]
+    )
+    translation_values = translation.singular_values
+    _refuse_degenerate(translation_values[:RANK], flanges, directions)
+
+    conditioning = min(_conditioning(rotation_values), _conditioning(translation_values[:RANK]))
+    R_H_E = smallest_rotation(T_H_E[:3, 2], rotation.z_H_E) @ T_H_E[:3, :3]
+    return Estimate(
+        T_P_A=transform(rotation.R_P_A, translation.p_P_A),
+        T_H_E=transform(R_H_E, translation.p_H_E),
+        optical_axis=rotation.z_H_E,
+        iterations=rotation.iterations,
+        unobservable=_UNOBSERVABLE,
+        rotation_singular_values=rotation_values,
+        translation_singular_values=translation_values,
+        conditioning=conditioning,
+        warnings=_warnings(conditioning),
+    )
+
+
+def _members(constraints: Sequence[Hashable]) -> dict[Hashable, list[int]]:
+    members: dict[Hashable, list[int]] = {}
+    for index, name in enumerate(constraints):
+        members.setdefault(name, []).append(index)
+    if len(members) < FEWEST_CONSTRAINTS:
+        raise Degenerate(f"{len(members)} constraints, at least {FEWEST_CONSTRAINTS} are needed")
+    return members
+
+
+def _directions(members: dict[Hashable, list[int]], points: Array, nominal: Array) -> Array:
+    # The nominal axis tells the line's sign: it is wrong only from an error of 90 degrees on, whereas a wrong
+    # nominal position may well lie beyond the nearest point.
+    directions = np.empty((len(members), 3))
+    for k, (name, m) in enumerate(members.items()):
+        try:
+            directions[k] = fit_line(points[m], nominal[k]).direction
+        except Degenerate as error:
+            raise Degenerate(f"constraint {name}: {error}") from error
+    return directions
+
+
+def _conditioning(singular_values: Array) -> float:
+    return float(singular_values[-1] / singular_values[0])
+
+
+def _refuse_degenerate(singular_values: Array, flanges: Array, directions: Array) -> None:
+    conditioning = _conditioning(singular_values)
+    if conditioning >= DEGENERATE:
+        return
+    if np.max(rotation_angle(flanges, flanges[0])) < _SAME_DIRECTION:
+        reason = "the active flange has the same orientation in all constraints"
+    elif np.max(np.linalg.norm(np.cross(directions, directions[0]), axis=1)) < _SAME_DIRECTION:
+        reason = "the optical axes of all constraints are parallel"
+    else:
+        reason = "the active flange is turned about one axis only between the constraints"
+    raise Degenerate(f"{reason} (conditioning {conditioning:.1e}, at least {DEGENERATE:g} is needed)")
+
+
+def _warnings(conditioning: float) -> tuple[str, ...]:
+    if conditioning >= WEAK:
+        return ()
+    return (
+        f"weak conditioning {conditioning:.3f} (good sets have more than {WEAK:g}):"
+        " turn the active flange by at least 30 deg about two axes",
+    )

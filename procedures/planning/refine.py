@@ -1,0 +1,65 @@
+"""Belief from what has been seen so far: all corners of all views, with the nominal as prior."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualcal_hal.robot import Joints
+from dualcal_hal.transforms import Array
+from procedures.detection import board_poses
+from procedures.estimation.corner_fit import Prior, fit_corners
+from procedures.planning.belief import NOMINAL_SIGMA_BASE, NOMINAL_SIGMA_CAMERA, Belief
+from procedures.planning.model import CellModel
+
+WORST_FIT = 3.0
+"""px rms above which the views do not belong to one cell: the board, its mount or the arms are not as told."""
+
+_DETECTION_SIGMA = 0.02  # px; far below what the joints' noise does in the image
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A board seen: both arms' joint angles (rad) and the corners (n, 2) in px."""
+
+    active: Joints
+    passive: Joints
+    corners: Array
+
+
+def refine(model: CellModel, views: Sequence[View]) -> tuple[Belief, float]:
+    """The belief that explains the views, and its rms in px per axis."""
+    corners = np.stack([view.corners for view in views])
+    # Only few views need starts of their own; with many the nominal has been left behind long ago.
+    starts = [np.stack([T for T, _ in board_poses(view.corners, model.board, model.intrinsics)]) for view in views[:5]]
+    fit = fit_corners(
+        model.active.chain.forward([view.active for view in views]),
+        model.target_in_passive([view.passive for view in views]),
+        model.board.corners,
+        corners,
+        model.intrinsics.matrix,
+        model.intrinsics.distortion,
+        Prior(model.nominal.T_P_A, model.nominal.T_H_E, (*NOMINAL_SIGMA_BASE, *NOMINAL_SIGMA_CAMERA)),
+        float(np.hypot(_DETECTION_SIGMA, arrival_scatter(model))),
+        [*starts, *([None] * (len(views) - len(starts)))],
+    )
+    return Belief(fit.T_P_A, fit.T_H_E, fit.covariance, f"{len(views)} views"), fit.rms
+
+
+def arrival_scatter(model: CellModel) -> float:
+    """How far the feature lands from where it was sent, px per axis, 1 sigma, by the passive arm's joint noise.
+
+    The lateral motion of the target by each joint's error, over random postures, seen from the middle distance.
+    """
+    arm = model.passive
+    rng = np.random.default_rng(0)
+    q = rng.uniform(arm.lower, arm.upper, (400, arm.chain.joints))
+    flange = arm.chain.forward(q)
+    J = arm.chain.jacobian(q)
+    lever = flange[:, :3, :3] @ model.T_F_T[:3, 3]
+    at_target = J[:, :3] + np.cross(J[:, 3:], lever[:, :, None], axis=1)
+    per_axis = np.sqrt(np.mean(np.sum(at_target**2, axis=2)))
+    focal = float(np.sqrt(model.intrinsics.matrix[0, 0] * model.intrinsics.matrix[1, 1]))
+    return float(focal / np.mean(model.distance) * arm.joint_sigma * per_axis)

@@ -1,0 +1,138 @@
+"""What a procedure may ask of the engine. A procedure is a generator of these steps that gets replies sent in.
+
+The lower-case functions are the typed way to ask: ``states = yield from read()``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Any, Protocol, Self, TypeVar
+
+from dualcal_hal.camera import Frame, Image
+from dualcal_hal.robot import Joints, RobotState
+from dualcal_hal.session.journal import StepKey
+from dualcal_hal.transforms import Array
+
+T = TypeVar("T")
+Procedure = Generator[Any, Any, T]
+
+
+class Record(Protocol):
+    """A result that survives in the journal: plain JSON, with units in the names."""
+
+    def to_record(self) -> dict[str, Any]: ...
+
+    @classmethod
+    def from_record(cls, record: dict[str, Any]) -> Self: ...
+
+
+R = TypeVar("R", bound=Record)
+
+
+@dataclass(frozen=True)
+class ArmReading:
+    """What an arm reports, and the target it was last sent to in this run (None before the first)."""
+
+    state: RobotState
+    commanded: Joints | None
+
+
+@dataclass(frozen=True)
+class Readings:
+    active: ArmReading
+    passive: ArmReading
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """A frame with both arms' joint angles (rad), the mean of what was read before and after the exposure."""
+
+    frame: Frame
+    active: Joints
+    passive: Joints
+
+
+@dataclass(frozen=True)
+class Read:
+    """Read both arms."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """Move one arm straight in joint space to ``goal`` (rad) and wait until it has settled."""
+
+    arm: str
+    goal: Joints
+
+
+@dataclass(frozen=True)
+class Look:
+    """Read both arms, take a frame exposed from now on, read both again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Believe:
+    """From here on the guard judges clearance with these transforms (4, 4)."""
+
+    T_P_A: Array
+    T_H_E: Array
+
+
+@dataclass(frozen=True, eq=False)
+class KeepImage:
+    """Store an image of the session durably, under a name like ``calibration/00/0``."""
+
+    name: str
+    image: Image
+
+
+@dataclass(frozen=True, eq=False)
+class KeepDocument:
+    """Store a JSON document of the session durably, such as ``plan.json``."""
+
+    file_name: str
+    document: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Tell:
+    """Hand an event to the observers."""
+
+    event: object
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A part of the procedure whose result is journalled under ``key`` when it is finished.
+
+    In a run that goes on from a journal, a finished key is answered from there and the body is not run.
+    """
+
+    key: StepKey
+    body: Callable[[], Procedure[Any]]
+    result: type[Record]
+
+
+def read() -> Procedure[Readings]:
+    reply: Readings = yield Read()
+    return reply
+
+
+def move(arm: str, goal: Joints) -> Procedure[RobotState]:
+    reply: RobotState = yield Move(arm, goal)
+    return reply
+
+
+def look() -> Procedure[Sighting]:
+    reply: Sighting = yield Look()
+    return reply
+
+
+def tell(event: object) -> Procedure[None]:
+    yield Tell(event)
+
+
+def task(key: StepKey, body: Callable[[], Procedure[R]], result: type[R]) -> Procedure[R]:
+    reply: R = yield Task(key, body, result)
+    return reply

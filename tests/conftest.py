@@ -1,0 +1,34 @@
+"""What holds for every test: it leaves no thread and no socket behind."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+_GRACE = 1.0  # s in which a thread that was told to end may do so
+
+
+@pytest.fixture(autouse=True)
+def _nothing_left_behind() -> Iterator[None]:
+    threads, sockets = set(threading.enumerate()), _sockets()
+    yield
+    started = set(threading.enumerate()) - threads
+    for thread in started:
+        thread.join(_GRACE)
+    left = [thread.name for thread in started if thread.is_alive()]
+    assert not left, f"threads left behind: {left}"
+    assert not _sockets() - sockets, "sockets left behind"
+
+
+def _sockets() -> set[str]:
+    links = set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        try:
+            links.add(os.readlink(descriptor))
+        except FileNotFoundError:  # the descriptor of this very listing
+            continue
+    return {link for link in links if link.startswith("socket:")}

@@ -1,0 +1,86 @@
+"""Commands and their options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tools.cli.exits import reported, signals_handled
+
+app = typer.Typer(
+    name="dualcal",
+    help="Find where two robot arms stand to each other and where the camera sits on its flange.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Cell = Annotated[Path, typer.Argument(metavar="CELL", help="The cell file (YAML).", show_default=False)]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="PATH=VALUE", help="Override a value of the cell file; may be repeated."),
+]
+Method = Annotated[str | None, typer.Option(help="Estimator; overrides procedure.method.")]
+Json = Annotated[bool, typer.Option("--json", help="Print result.json alone on standard output.")]
+
+
+def main() -> None:
+    """Entry point of the ``dualcal`` command."""
+    with signals_handled():
+        app()
+
+
+@app.command()
+def run(
+    cell: Cell,
+    out: Annotated[Path | None, typer.Option(help="Session folder. Default: sessions/<time>-<cell>.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Sets procedure.seed and simulation.seed.")] = None,
+    method: Method = None,
+    overrides: Set = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show stand-off, looks and a provisional plan only.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Move without asking, on a cell that is not simulated.")] = False,
+    json: Json = False,
+) -> None:
+    """Calibrate a cell: look, plan, align and capture, estimate, verify.
+
+    Exit code 0 for verdict ok, 1 for any other verdict or a device fault, 2 for a call, cell file or captures that
+    cannot be used or when there is no plan, 130 when interrupted.
+    """
+    with reported():
+        from tools.cli.run import RunOptions, run_cell
+
+        code = run_cell(RunOptions(cell, out, seed, method, tuple(overrides or ()), dry_run, yes, json))
+    raise typer.Exit(code)
+
+
+@app.command()
+def estimate(
+    captures: Annotated[Path, typer.Argument(metavar="CAPTURES|SESSION", help="captures.json or a session folder.")],
+    cell: Annotated[Path | None, typer.Option(help="The cell file; a session brings its own.")] = None,
+    method: Method = None,
+    truth: Annotated[Path | None, typer.Option(help="JSON {transform name: 4x4, m} to compare with.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Where to write the result (JSON).")] = None,
+    overrides: Set = None,
+    json: Json = False,
+) -> None:
+    """Estimate and verify from captures, without any device.
+
+    Exit code 0 once a result is written, 2 for a call, cell file or captures that cannot be used.
+    """
+    with reported():
+        from tools.cli.estimate import EstimateOptions, estimate_captures
+
+        estimate_captures(EstimateOptions(captures, cell, method, truth, out, tuple(overrides or ()), json))
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of a cell file."""
+    with reported():
+        import json
+
+        from dualcal_hal.cellfile import cell_schema
+
+        typer.echo(json.dumps(cell_schema(), indent=2))

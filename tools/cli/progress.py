@@ -1,0 +1,81 @@
+"""Live progress of a run: a bar for each use on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from procedures.events import LookTaken, PlanReady, PointDone
+
+
+class Lines:
+    """One line for each event."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+    def __call__(self, event: object) -> None:
+        self._console.print(str(event), markup=False, highlight=False, soft_wrap=True)
+
+
+class Bars:
+    """Bars for looks and points, with the latest point beside them."""
+
+    def __init__(self, console: Console) -> None:
+        self._bars = Progress(
+            TextColumn("{task.description:<12}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[latest]}"),
+            console=console,
+        )
+        self._tasks: dict[str, TaskID] = {}
+
+    def __enter__(self) -> Self:
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bars.stop()
+
+    def __call__(self, event: object) -> None:
+        match event:
+            case LookTaken():
+                self._advance("first look", event.count, "found" if event.found else event.reason)
+            case PlanReady(plan):
+                for constraint in plan.constraints:
+                    self._task(constraint.use, sum(len(c.positions) for c in plan.of(constraint.use)))
+            case PointDone():
+                offset = "" if event.offset_px is None else f" {max(map(abs, event.offset_px)):.3f} px"
+                where = f"{event.constraint} position {event.position + 1}/{event.positions}"
+                text = f"{where}: {event.outcome}, {event.frames} pictures{offset}"
+                self._advance(event.use, 0, text, by=1 if event.captured else 0)
+            case _:
+                self._bars.console.print(str(event), markup=False, highlight=False)
+
+    def _task(self, name: str, total: int) -> TaskID:
+        if name not in self._tasks:
+            self._tasks[name] = self._bars.add_task(name, total=total, latest="")
+        return self._tasks[name]
+
+    def _advance(self, name: str, total: int, latest: str, by: int = 1) -> None:
+        self._bars.update(self._task(name, total), advance=by, latest=latest)
+
+
+def progress(console: Console) -> Lines | Bars:
+    """What suits the console."""
+    return Bars(console) if console.is_terminal else Lines(console)

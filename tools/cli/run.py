@@ -1,0 +1,118 @@
+"""``dualcal run``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+from rich.console import Console
+
+from dualcal_hal.cell import Cell
+from dualcal_hal.cellfile import CellFile, load_cell
+from dualcal_hal.clock import utc_now
+from dualcal_hal.errors import UsageError
+from dualcal_hal.guard import Placement
+from dualcal_hal.registry import backend_class
+from dualcal_hal.session.captures import write_captures
+from dualcal_hal.session.folder import Session
+from procedures.alignment import largest_alignment_error, tolerance_px
+from procedures.calibrate import Calibration, captures_of
+from procedures.engine import Engine
+from procedures.observers import Observers
+from procedures.planning.model import CellModel
+from procedures.rehearsal import rehearse
+from tools.cli.exits import FAULT, aborting_with
+from tools.cli.progress import progress
+from tools.cli.show import finish, show_rehearsal
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What the command line says."""
+
+    cell: Path
+    out: Path | None
+    seed: int | None
+    method: str | None
+    overrides: tuple[str, ...]
+    dry_run: bool
+    yes: bool
+    json: bool
+
+
+def run_cell(options: RunOptions) -> int:
+    """Prepare, run, analyse; returns the exit code."""
+    file = _load(options)
+    # With --json standard output is for the result alone.
+    console = Console(stderr=options.json)
+    model = CellModel(file.cell)
+    calibration = Calibration(file.cell, model)
+    _warn_of_alignment_error(console, file, model)
+    if options.dry_run:
+        show_rehearsal(console, file.cell, rehearse(file.cell, model))
+        return 0
+    _confirm(file, options.yes)
+    started = utc_now()
+    folder = options.out or Path("sessions") / f"{started:%Y%m%d-%H%M%S}-{file.cell.name}"
+    session = Session.create(folder, file.text)
+    try:
+        _execute(file, model, calibration, session, console)
+    finally:
+        captures = captures_of(session.journal, file.sha256, started.isoformat(timespec="seconds"))
+        write_captures(session.captures_path, captures)
+    result = finish(console, file, session, captures, as_json=options.json)
+    return 0 if result.verdict == "ok" else FAULT
+
+
+def _load(options: RunOptions) -> CellFile:
+    overrides = list(options.overrides)
+    if options.method is not None:
+        overrides.append(f"procedure.method={options.method}")
+    if options.seed is not None:
+        overrides.append(f"procedure.seed={options.seed}")
+        if load_cell(options.cell, options.overrides).simulation is not None:
+            overrides.append(f"simulation.seed={options.seed}")
+    return load_cell(options.cell, overrides)
+
+
+def _execute(
+    file: CellFile, model: CellModel, calibration: Calibration, session: Session, console: Console
+) -> None:
+    placement = Placement(model.geometry(model.nominal), model.nominal.T_P_A)
+    try:
+        with (
+            progress(console) as watcher,
+            Observers(watcher) as observers,
+            Cell(file, placement) as cell,
+        ):
+            engine = Engine(cell, model, session, observers)
+            with aborting_with(engine.abort):
+                engine.run(calibration.steps())
+    except Exception as error:
+        error.add_note(f"the arms were stopped; what was captured is in {session.folder}")
+        raise
+
+
+def _confirm(file: CellFile, yes: bool) -> None:
+    simulated = all(backend_class(entry.type).simulated for entry in file.cell.backends.values())
+    if simulated or yes:
+        return
+    if not typer.confirm(f"Cell '{file.cell.name}' is not simulated: both arms will move. Go on?", default=False):
+        raise UsageError("not confirmed; nothing was moved")
+
+
+def _warn_of_alignment_error(console: Console, file: CellFile, model: CellModel) -> None:
+    """Paper, section 4.2: the alignment's error should be below the arms' repeatability."""
+    tolerance = tolerance_px(model, file.cell.procedure.tolerance_px)
+    error = largest_alignment_error(model, tolerance)
+    repeatability = min(file.cell.active.repeatability, file.cell.passive.repeatability)
+    comparison = f"e_c_max {error * 1e3:.3f} mm at {tolerance:.3g} px and {model.distance[1] * 1e3:.0f} mm"
+    if error > repeatability:
+        console.print(
+            f"warning: {comparison} exceeds the arms' repeatability of {repeatability * 1e3:.3g} mm: "
+            "lower procedure.tolerance_px or distance_mm",
+            style="yellow",
+        )
+    else:
+        console.print(f"{comparison}, below the arms' repeatability of {repeatability * 1e3:.3g} mm")

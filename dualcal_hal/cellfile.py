@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.constructor import RoundTripConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, SequenceNode
 from ruamel.yaml.reader import ReaderError
@@ -213,8 +214,20 @@ def _key_problems(node: Node, location: Location) -> Iterator[tuple[Any, str]]:
         yield from _key_problems(value, here)
 
 
+class _Constructor(RoundTripConstructor):
+    """Numbers with an exponent as plain floats: ruamel's own come out changed in their last digits."""
+
+    def construct_exact_float(self, node: Any) -> float:
+        number: float = self.construct_yaml_float(node)
+        return float(number) if "e" in node.value.lower() else number
+
+
+_Constructor.add_constructor("tag:yaml.org,2002:float", _Constructor.construct_exact_float)
+
+
 def _round_trip() -> YAML:
     yaml = YAML()
+    yaml.Constructor = _Constructor
     yaml.preserve_quotes = True
     yaml.width = 1_000_000
     yaml.indent(mapping=2, sequence=4, offset=2)

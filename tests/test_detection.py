@@ -216,6 +216,16 @@ def test_corners_that_are_not_a_boards_are_refused_even_if_the_search_returns_th
         assert missed(detector.detect(clutter(rng))).reason is Miss.NOT_FOUND
 
 
+def test_a_grid_of_dark_spots_is_no_checkerboard(detector: Detector, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = np.full((768, 1024), 200, np.uint8)
+    for i, j in np.ndindex(5, 5):
+        image[300 + 60 * i : 335 + 60 * i, 400 + 60 * j : 435 + 60 * j] = 30
+    image = cv2.GaussianBlur(image, (0, 0), 0.6)
+    between = [(477 + 30 * (j + i), 407 + 30 * (i - j)) for i in range(3) for j in range(3)]
+    monkeypatch.setattr(cv2, "findChessboardCorners", lambda image, size, flags: (True, np.array(between, dtype=float)))
+    assert missed(detector.detect(image)).reason is Miss.NOT_FOUND
+
+
 def test_a_larger_checkerboard_is_not_taken_for_a_part_of_it(
     detector: Detector, monkeypatch: pytest.MonkeyPatch
 ) -> None:

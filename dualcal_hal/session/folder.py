@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from dualcal_hal.camera import Image
 from dualcal_hal.errors import UsageError
-from dualcal_hal.session.files import write_atomically
+from dualcal_hal.session.files import write_atomically, write_document
 from dualcal_hal.session.journal import Journal
 
 
@@ -56,4 +55,4 @@ class Session:
 
     def write_document(self, file_name: str, document: dict[str, Any]) -> None:
         """Store a JSON document durably, all of it or nothing."""
-        write_atomically(self.folder / file_name, json.dumps(document, indent=1, allow_nan=False).encode() + b"\n")
+        write_document(self.folder / file_name, document)

@@ -19,18 +19,18 @@ def sample(image: Image, pixels: Array) -> Array:
     return np.asarray(map_coordinates(image, [y, x], order=1, mode="nearest", output=float))
 
 
-def contrast(image: Image, homography: Array, lattice: Array) -> Array:
-    """White minus black around each lattice point, in grey levels.
+def contrast(image: Image, homography: Array, lattice: Array) -> tuple[Array, Array]:
+    """White minus black around each lattice point, and the mean of all around it: (n,), (n,) grey levels.
 
-    homography: (3, 3) from lattice coordinates (column, row) to px; lattice: (n, 2). The result (n,) has one
-    sign all over a checkerboard, halves at its rim and vanishes in expectation off it.
+    homography: (3, 3) from lattice coordinates (column, row) to px; lattice: (n, 2). The contrast has one sign
+    all over a checkerboard, halves at its rim and vanishes in expectation off it.
     """
     quadrants = _TO_QUADRANT * np.array([[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]])
     places = (lattice[:, None] + quadrants).reshape(-1, 1, 2)
     pixels = np.asarray(cv2.perspectiveTransform(places, homography), dtype=float)
     grey = sample(image, pixels.reshape(-1, 4, 2))
     parity = 1.0 - 2.0 * (np.rint(lattice).sum(axis=1) % 2)
-    return np.asarray(parity * (grey @ np.array([0.5, 0.5, -0.5, -0.5])))
+    return parity * (grey @ np.array([0.5, 0.5, -0.5, -0.5])), grey.mean(axis=1)
 
 
 def edge_blur(image: Image, grid: Array, spacing: float) -> float:

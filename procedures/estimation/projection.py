@@ -89,4 +89,4 @@ def _normalised(points: ArrayLike) -> Array:
 
 
 def _pixels(distorted: Array, matrix: Array) -> Array:
-    return distorted * np.array([matrix[0, 0], matrix[1, 1]]) + matrix[:2, 2]
+    return np.asarray(distorted * np.array([matrix[0, 0], matrix[1, 1]]) + matrix[:2, 2])

@@ -49,7 +49,7 @@ def estimate_rotation(directions: Array, R_A_H: Array, R_P_A: Array, z_H_E: Arra
     is ``-[mu x]``. It ends when an update of the rotation is below 1e-10; raises Degenerate if none is.
     """
     nominal = R_A_P = R_P_A.T
-    pseudo_inverse = np.linalg.pinv(-skew(directions).reshape(-1, 3))
+    pseudo_inverse = np.asarray(np.linalg.pinv(-skew(directions).reshape(-1, 3)), dtype=float)
     history: list[Iteration] = []
     for t in range(MOST_ALTERNATIONS + MOST_JOINT_STEPS):
         if t < MOST_ALTERNATIONS:

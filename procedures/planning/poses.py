@@ -8,7 +8,6 @@ target within the angle constraint, eq. (13) (step 3); a few Newton steps bring 
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +32,7 @@ LEAST_TURN = np.deg2rad(30.0)
 
 _PASSIVE_SAMPLES = 12000
 _AXIS_SAMPLES = 3000
-_AXES_AT_ONCE = 32
+_AXES_AT_ONCE = 24
 _AXES_TRIED = 1500
 _PICKS = 6  # postures of the passive arm tried for each position
 _NEIGHBOURS = 32
@@ -136,13 +135,15 @@ class PosePlanner:
         q, reached = q.reshape(*shape, -1), reached.reshape(shape) & found
         self._count("the passive arm does not reach the position", reached)
         usable = reached & self._usable(active, q, T_P_E, reached)
-        candidates = []
-        for k in np.flatnonzero(np.all(np.any(usable, axis=2), axis=1)):
-            chain = _least_travel(self._model.passive, q[k], usable[k])
-            candidate = self._checked(active[k], chain, T_P_E[k], distance)
-            if candidate is not None:
-                candidates.append(candidate)
-        return candidates
+        shown = np.flatnonzero(np.all(np.any(usable, axis=2), axis=1))
+        if len(shown) == 0:
+            return []
+        active, T_P_E = active[shown], T_P_E[shown]
+        passive = np.stack([_least_travel(q[k], usable[k]) for k in shown])
+        roomy = self._has_room(active, passive, T_P_E)
+        self._count("no room for alignment", roomy)
+        candidates = (self._candidate(active[k], passive[k], T_P_E[k], distance) for k in np.flatnonzero(roomy))
+        return [candidate for candidate in candidates if candidate is not None]
 
     def _passive_starts(self, T_P_E: Array, distance: Array) -> tuple[Array, Array, Mask]:
         """Starts (a, m, picks, n) and target poses (a, m, picks, 4, 4) near library postures, and which exist."""
@@ -181,30 +182,32 @@ class PosePlanner:
             usable[tuple(w[between >= model.margin] for w in which)] = True
         return usable
 
-    def _checked(self, active: Array, passive: Array, T_P_E: Array, distance: Array) -> _Candidate | None:
+    def _has_room(self, active: Array, passive: Array, T_P_E: Array) -> Mask:
+        """Which axes (a, n) leave room at all their positions (a, m, n) to move each way in the camera plane."""
         model = self._model
-        for start, goal in itertools.pairwise(passive):
-            if not self._ways.clear(model.passive.name, Posture.of(active, start), Posture.of(active, goal).passive):
-                self.refused["the way between two positions is not clear"] += 1
-                return None
-        if not self._has_room(active, passive, T_P_E):
-            self.refused["no room for alignment"] += 1
+        steps = ROOM * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        shifts = steps @ np.swapaxes(T_P_E[:, None, :3, :2], 2, 3)  # (a, 1, 4, 3)
+        goals = np.repeat(model.target_in_passive(passive)[:, :, None], len(steps), axis=2)
+        goals[..., :3, 3] += shifts
+        starts = np.repeat(passive[:, :, None], len(steps), axis=2)
+        q, reached = _solve(model.passive, model, goals.reshape(-1, 4, 4), starts.reshape(-1, starts.shape[-1]))
+        room = np.all(reached.reshape(len(active), -1), axis=1)
+        each = len(q) // len(active)
+        which = np.repeat(room, each)
+        own = self._ways.geometry.clearance(np.repeat(active, each, axis=0)[which], q[which], self._belief.T_P_A)
+        room[room] = np.all(own.reshape(-1, each) >= model.margin, axis=1)
+        return np.asarray(room)
+
+    def _candidate(self, active: Array, passive: Array, T_P_E: Array, distance: Array) -> _Candidate | None:
+        model = self._model
+        if not self._ways.clear(model.passive.name, Posture.of(active, passive[0]), passive[1:]):
+            self.refused["the way between two positions is not clear"] += 1
             return None
         T_P_T = model.target_in_passive(passive)
         clearance = self._ways.geometry.clearance(active[None], passive, self._belief.T_P_A)
         tilt = np.arccos(np.clip(-T_P_T[:, :3, 2] @ T_P_E[:3, 2], -1.0, 1.0))
         information = _information(T_P_E, self._belief, T_P_T[:, :3, 3])
         return _Candidate(active, passive, tilt, distance, clearance, information)
-
-    def _has_room(self, active: Array, passive: Array, T_P_E: Array) -> bool:
-        model = self._model
-        shifts = ROOM * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]) @ T_P_E[:3, :2].T
-        goals = np.repeat(model.target_in_passive(passive), len(shifts), axis=0)
-        goals[:, :3, 3] += np.tile(shifts, (len(passive), 1))
-        q, reached = _solve(model.passive, model, goals, np.repeat(passive, len(shifts), axis=0))
-        if not np.all(reached):
-            return False
-        return bool(np.all(self._ways.geometry.clearance(active[None], q, self._belief.T_P_A) >= model.margin))
 
     # -- choice and order ---------------------------------------------------------------------------------------
 
@@ -297,7 +300,7 @@ def _tilted(axis: Array, largest: float, rng: np.random.Generator) -> Array:
     return np.asarray(cosine[..., None] * axis + sine[..., None] * sideways)
 
 
-def _least_travel(arm: ArmModel, q: Array, usable: Mask) -> Array:
+def _least_travel(q: Array, usable: Mask) -> Array:
     """Of usable postures (m, picks, n) one each, (m, n), with the least largest joint travel from one to the next."""
     positions = len(q)
     cost = np.where(usable[0], 0.0, np.inf)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dualcal_hal.geometry import CellGeometry, interpolate
 from dualcal_hal.robot import Joints
@@ -51,14 +52,14 @@ class WayFinder:
                 return way
         return None
 
-    def clear(self, arm: str, start: Posture, goal: Joints) -> bool:
-        """Whether one arm's straight move from ``start`` keeps clear."""
-        moving = np.array([start.active if arm == self._model.active.name else start.passive, goal])
-        path = interpolate(moving)
+    def clear(self, arm: str, start: Posture, waypoints: ArrayLike) -> bool:
+        """Whether one arm's straight moves from ``start`` through waypoints (k, n) keep clear, the other standing."""
         if arm == self._model.active.name:
+            path = interpolate(np.vstack([start.active, waypoints]))
             own = self.geometry.active.own_clearance(path)
             between = self.geometry.between(path, [start.passive], self._T_P_A)
         else:
+            path = interpolate(np.vstack([start.passive, waypoints]))
             own = self.geometry.passive.own_clearance(path)
             between = self.geometry.between([start.active], path, self._T_P_A)
         clearance = np.minimum(own, between)
@@ -80,7 +81,7 @@ class WayFinder:
     def _way_clear(self, start: Posture, way: tuple[Leg, ...]) -> bool:
         posture = start
         for leg in way:
-            if not self.clear(leg.arm, posture, leg.goal):
+            if not self.clear(leg.arm, posture, [leg.goal]):
                 return False
             if leg.arm == self._model.active.name:
                 posture = Posture(leg.goal, posture.passive)

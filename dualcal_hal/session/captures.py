@@ -1,0 +1,220 @@
+"""``captures.json``: what a run measured, one entry for each frame that counts.
+
+The public format ``dualcal.captures/1``. Other programs write it too: keys that are not known are ignored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from dualcal_hal.errors import FormatError, Problem
+from dualcal_hal.robot import Joints
+from dualcal_hal.session.files import read_document, write_document
+
+FORMAT = "dualcal.captures/1"
+
+Use = Literal["calibration", "verification"]
+Pixel = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class CaptureRecord:
+    """One datum.
+
+    constraint: name of the optical axis it belongs to; active_arrival: a new number each time the active arm
+    arrived anew (captures that share it share that arm's error); joints: rad, mean of the readings before and after
+    the exposure; feature, corners: px in the distorted image, corners by index on the board or None; image_size:
+    width and height, px; aligned: whether the feature was within the tolerance; order_known: False where two
+    orientations of the pattern fitted.
+    """
+
+    id: str
+    use: Use
+    constraint: str
+    position: int
+    active_arrival: int
+    active_joints: Joints
+    passive_joints: Joints
+    feature: Pixel
+    corners: tuple[Pixel, ...] | None
+    image_size: tuple[int, int]
+    aligned: bool = True
+    order_known: bool = True
+
+    def to_record(self) -> dict[str, Any]:
+        """The entry as in the file."""
+        return {
+            "id": self.id,
+            "use": self.use,
+            "constraint": self.constraint,
+            "position": self.position,
+            "active_arrival": self.active_arrival,
+            "active_joints_rad": list(self.active_joints),
+            "passive_joints_rad": list(self.passive_joints),
+            "feature_px": list(self.feature),
+            "corners_px": None if self.corners is None else [list(corner) for corner in self.corners],
+            "image_px": list(self.image_size),
+            "aligned": self.aligned,
+            "order": "known" if self.order_known else "unknown",
+        }
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> CaptureRecord:
+        """From an entry that names its arrival, as :meth:`to_record` writes it; FormatError otherwise."""
+        entry, problems = _entry(record, str(record.get("id", "capture")))
+        if entry is not None and entry.active_arrival is None:
+            problems = [Problem(entry.id, "active_arrival: missing")]
+        if entry is None or entry.active_arrival is None:
+            raise FormatError(problems)
+        return entry.capture(entry.active_arrival)
+
+
+@dataclass(frozen=True)
+class Captures:
+    """The captures of a run; cell_sha256 of the cell file used and the time of starting (ISO 8601) if known."""
+
+    cell_sha256: str | None
+    started: str | None
+    captures: tuple[CaptureRecord, ...]
+
+
+def write_captures(path: Path, captures: Captures) -> None:
+    """Write the public file atomically."""
+    header = {"cell_sha256": captures.cell_sha256, "started": captures.started}
+    known = {key: value for key, value in header.items() if value is not None}
+    entries = [capture.to_record() for capture in captures.captures]
+    write_document(path, {"format": FORMAT, **known, "captures": entries})
+
+
+def read_captures(path: Path, *, joints: tuple[int, int] | None = None, corners: int | None = None) -> Captures:
+    """Read the public file.
+
+    joints: of the active and passive arm, corners: of the board, where the cell is known. Raises FormatError
+    with all problems, each at the capture's id or the file. Where no arrival is given a constraint is one.
+    """
+    document = read_document(path, FORMAT)
+    problems = list(_header_problems(document, str(path)))
+    raw = document.get("captures")
+    entries: list[_Entry] = []
+    for index, record in enumerate(raw if isinstance(raw, list) else []):
+        entry, wrong = _entry(record, _name(record, index))
+        problems += wrong
+        if entry is not None:
+            entries.append(entry)
+            problems += _mismatches(entry, joints, corners)
+    problems += _duplicates([_name(record, index) for index, record in enumerate(raw)] if isinstance(raw, list) else [])
+    if problems:
+        raise FormatError(problems)
+    return Captures(document.get("cell_sha256"), document.get("started"), tuple(_with_arrivals(entries)))
+
+
+_Finite = Annotated[float, Field(strict=True)]
+_Whole = Annotated[int, Field(strict=True)]
+_Size = Annotated[int, Field(strict=True, gt=0)]
+_Joints = Annotated[tuple[_Finite, ...], Field(min_length=1)]
+
+
+def _number_as_name(value: Any) -> Any:
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+_Name = Annotated[str, Field(strict=True, min_length=1), BeforeValidator(_number_as_name)]
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+    id: _Name
+    use: Use
+    constraint: _Name
+    position: _Whole
+    active_arrival: _Whole | None = None
+    active_joints_rad: _Joints
+    passive_joints_rad: _Joints
+    feature_px: tuple[_Finite, _Finite]
+    corners_px: tuple[tuple[_Finite, _Finite], ...] | None
+    image_px: tuple[_Size, _Size]
+    aligned: Annotated[bool, Field(strict=True)] = True
+    order: Literal["known", "unknown"] = "known"
+
+    def capture(self, arrival: int) -> CaptureRecord:
+        return CaptureRecord(
+            id=self.id,
+            use=self.use,
+            constraint=self.constraint,
+            position=self.position,
+            active_arrival=arrival,
+            active_joints=self.active_joints_rad,
+            passive_joints=self.passive_joints_rad,
+            feature=self.feature_px,
+            corners=self.corners_px,
+            image_size=self.image_px,
+            aligned=self.aligned,
+            order_known=self.order == "known",
+        )
+
+
+def _entry(record: Any, name: str) -> tuple[_Entry | None, list[Problem]]:
+    if not isinstance(record, Mapping):
+        return None, [Problem(name, "is not a JSON object")]
+    try:
+        return _Entry.model_validate(record), []
+    except ValidationError as error:
+        return None, [Problem(name, _words(details)) for details in error.errors()]
+
+
+def _words(details: Any) -> str:
+    key, *indices = details["loc"]
+    where = f"{key}{''.join(f'[{index}]' for index in indices)}"
+    if details["type"] == "missing":
+        return f"{where}: missing"
+    return f"{where}: {details['msg'][0].lower()}{details['msg'][1:]}, not {str(details['input'])[:60]}"
+
+
+def _header_problems(document: Mapping[str, Any], file: str) -> Iterator[Problem]:
+    for key in ("cell_sha256", "started"):
+        if not isinstance(document.get(key), str | None):
+            yield Problem(file, f"{key}: must be a text")
+    captures = document.get("captures")
+    if "captures" not in document:
+        yield Problem(file, "captures: missing")
+    elif not isinstance(captures, list):
+        yield Problem(file, "captures: must be a list")
+    elif not captures:
+        yield Problem(file, "captures: is empty")
+
+
+def _name(record: Any, index: int) -> str:
+    name = _number_as_name(record.get("id")) if isinstance(record, Mapping) else None
+    return name if isinstance(name, str) and name else f"captures[{index}]"
+
+
+def _duplicates(names: Sequence[str]) -> Iterator[Problem]:
+    for name in dict.fromkeys(names):
+        if (count := names.count(name)) > 1:
+            yield Problem(name, f"id: used by {count} captures")
+
+
+def _mismatches(entry: _Entry, joints: tuple[int, int] | None, corners: int | None) -> Iterator[Problem]:
+    if joints is not None:
+        both = (entry.active_joints_rad, entry.passive_joints_rad)
+        for key, angles, expected in zip(("active", "passive"), both, joints, strict=True):
+            if len(angles) != expected:
+                yield Problem(entry.id, f"{key}_joints_rad: {len(angles)} joint angles, the arm has {expected}")
+    if corners is not None and entry.corners_px is not None and len(entry.corners_px) != corners:
+        yield Problem(entry.id, f"corners_px: {len(entry.corners_px)} corners, the target has {corners}")
+
+
+def _with_arrivals(entries: Sequence[_Entry]) -> Iterator[CaptureRecord]:
+    unused = 1 + max((entry.active_arrival for entry in entries if entry.active_arrival is not None), default=-1)
+    assumed: dict[str, int] = {}
+    for entry in entries:
+        if entry.active_arrival is None:
+            yield entry.capture(assumed.setdefault(entry.constraint, unused + len(assumed)))
+        else:
+            yield entry.capture(entry.active_arrival)

@@ -1,0 +1,112 @@
+"""From captures and a cell to a result. No device, repeatable on any session."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+
+from dualcal_hal.config import METHODS, CellConfig
+from dualcal_hal.errors import DegenerateCaptures, UsageError
+from dualcal_hal.session.captures import CaptureRecord, Captures
+from dualcal_hal.session.result import Mismatch, Rejected, Result, Unobservable
+from dualcal_hal.transforms import Array
+from procedures.estimation import Degenerate, Estimate, Iteration, Statistics, estimate, judge, mismatch, statistics
+
+FARTHEST_ALIGNED = 1.0
+"""px in each axis; a feature point farther from the principal point than this does not count as aligned."""
+
+
+def analyse(captures: Captures, cell: CellConfig, method: str) -> Result:
+    """Estimate from the calibration captures, verify on the others.
+
+    A verification capture on a constraint or arrival that was calibrated with is rejected, and so is a capture whose
+    feature point is not aligned. Raises UsageError for an unknown method and DegenerateCaptures for captures
+    that do not determine the transforms.
+    """
+    if method not in METHODS:
+        raise UsageError(f"unknown method '{method}'; there are: {', '.join(METHODS)}")
+    used, rejected = _sort_out(captures.captures, cell)
+    calibration = [capture for capture in used if capture.use == "calibration"]
+    verification = [capture for capture in used if capture.use == "verification"]
+    try:
+        found = _estimate(calibration, cell)
+    except Degenerate as error:
+        reasons = "; ".join([str(error), *_summary(rejected)])
+        raise DegenerateCaptures(f"the captures do not determine the transforms: {reasons}") from error
+    before = _statistics(verification, cell, cell.nominal.T_P_A, cell.nominal.T_H_E)
+    after = _statistics(verification, cell, found.T_P_A, found.T_H_E)
+    verdict, reason = judge(after, cell.procedure.verification.limit)
+    return Result(
+        method=method,
+        T_P_A=found.T_P_A,
+        T_H_E=found.T_H_E,
+        optical_axis=found.optical_axis,
+        unobservable=tuple(Unobservable(**asdict(direction)) for direction in found.unobservable),
+        iterations=tuple(_iteration_record(iteration) for iteration in found.iterations),
+        mismatch_before=_record(before),
+        mismatch_after=_record(after),
+        captures_used=tuple(capture.id for capture in calibration),
+        captures_rejected=rejected,
+        verdict=verdict,
+        reasons=(reason, *found.warnings, *_summary(rejected)),
+    )
+
+
+def _sort_out(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[list[CaptureRecord], tuple[Rejected, ...]]:
+    calibrated = [capture for capture in captures if capture.use == "calibration"]
+    constraints = {capture.constraint for capture in calibrated}
+    arrivals = {capture.active_arrival for capture in calibrated}
+    used, rejected = [], []
+    for capture in captures:
+        offset = np.abs(np.array(capture.feature) - cell.camera.intrinsics.principal_point)
+        if np.any(offset > FARTHEST_ALIGNED):
+            reason = f"not aligned: the feature point is {offset[0]:.2f} and {offset[1]:.2f} px off the optical axis"
+        elif capture.use == "verification" and (
+            capture.constraint in constraints or capture.active_arrival in arrivals
+        ):
+            reason = f"verification on constraint {capture.constraint}, which was calibrated with"
+        else:
+            used.append(capture)
+            continue
+        rejected.append(Rejected(capture.id, reason))
+    return used, tuple(rejected)
+
+
+def _estimate(captures: Sequence[CaptureRecord], cell: CellConfig) -> Estimate:
+    T_A_H, T_P_T = _poses(captures, cell)
+    constraints = [capture.constraint for capture in captures]
+    return estimate(T_A_H, T_P_T, constraints, cell.nominal.T_P_A, cell.nominal.T_H_E)
+
+
+def _statistics(captures: Sequence[CaptureRecord], cell: CellConfig, T_P_A: Array, T_H_E: Array) -> Statistics | None:
+    if not captures:
+        return None
+    T_A_H, T_P_T = _poses(captures, cell)
+    return statistics(mismatch(T_P_A, T_H_E, T_A_H, T_P_T[:, :3, 3]))
+
+
+def _poses(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[Array, Array]:
+    """T_A_H and T_P_T (k, 4, 4)."""
+    active = np.array([capture.active_joints for capture in captures]).reshape(-1, cell.active.chain.joints)
+    passive = np.array([capture.passive_joints for capture in captures]).reshape(-1, cell.passive.chain.joints)
+    T_P_F = cell.passive.chain.forward(passive)
+    return cell.active.chain.forward(active), T_P_F @ cell.passive.target_mount_transform
+
+
+def _record(statistics: Statistics | None) -> Mismatch | None:
+    return None if statistics is None else Mismatch(**asdict(statistics))
+
+
+def _summary(rejected: Sequence[Rejected]) -> list[str]:
+    return [f"{len(rejected)} captures rejected, the first {rejected[0].id}: {rejected[0].reason}"] if rejected else []
+
+
+def _iteration_record(iteration: Iteration) -> dict[str, float | list[float]]:
+    return {
+        "rotation_update": iteration.rotation_update,
+        "axis_update": iteration.axis_update,
+        "rotation_error": iteration.rotation_error.tolist(),
+        "optical_axis_in_active_flange": iteration.optical_axis.tolist(),
+    }

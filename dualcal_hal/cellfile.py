@@ -364,7 +364,9 @@ def _seen(value: Any) -> str:
         return "a mapping"
     if isinstance(value, list):
         return "a list"
-    return "null" if value is None else repr(value)
+    if value is None:
+        return "null"
+    return repr(value) if isinstance(value, str | int | float) else str(value)
 
 
 def _suggestion(location: Location) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     Strict,
@@ -47,8 +48,16 @@ Location = tuple[str | int, ...]
 Number = Annotated[float, Strict()]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
-Count = Annotated[int, Strict()]
-Seed = Annotated[Count, Field(ge=0)]
+
+
+def _whole(value: Any) -> Any:
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+# The bound comes before the validator: behind it, pydantic would write it into the schema by a wrong name.
+Natural = Annotated[int, Strict(), Field(ge=0), BeforeValidator(_whole)]
+AtLeast1 = Annotated[int, Strict(), Field(ge=1), BeforeValidator(_whole)]
+AtLeast3 = Annotated[int, Strict(), Field(ge=3), BeforeValidator(_whole)]
 Vector = tuple[Number, Number, Number]
 Vector4 = tuple[Number, Number, Number, Number]
 Matrix3 = tuple[Vector, Vector, Vector]
@@ -272,7 +281,7 @@ class RobotConfig(Section):
     repeatability_mm: NotNegative
     """The maker's repeatability, mm; only warned with."""
     link_radius_mm: tuple[Positive, ...] | None = None
-    """Radius of the capsule about each link, mm; 55 each where left out."""
+    """Radius of the capsule about each link, mm; where left out 55 for the first three and 45 for the wrist's."""
     target_mount: TransformConfig | None = Field(default=None, validate_default=True)
     """Target in the passive flange; the passive arm's alone."""
 
@@ -354,7 +363,8 @@ class RobotConfig(Section):
     @property
     def link_radius(self) -> Array:
         """(n,) m."""
-        return np.array(self.link_radius_mm or [55.0] * len(self.kinematics.dh)) / 1000
+        joints = len(self.kinematics.dh)
+        return np.array(self.link_radius_mm or [55.0 if i < 3 else 45.0 for i in range(joints)]) / 1000
 
     @property
     def target_mount_transform(self) -> Array:
@@ -367,9 +377,9 @@ class RobotConfig(Section):
 class CameraBody(Section):
     """A capsule about the camera's optical axis, for clearance."""
 
-    radius_mm: Positive = 45.0
+    radius_mm: Positive = 35.0
     """Radius, mm."""
-    length_mm: NotNegative = 30.0
+    length_mm: NotNegative = 20.0
     """Length between the centres of its ends, mm."""
 
 
@@ -384,7 +394,7 @@ class CameraConfig(Section):
     """[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], px; pixel centres are integers."""
     distortion: tuple[Number, Number, Number, Number, Number]
     """OpenCV's k1, k2, p1, p2, k3."""
-    size_px: tuple[Annotated[Count, Field(gt=0)], Annotated[Count, Field(gt=0)]]
+    size_px: tuple[AtLeast1, AtLeast1]
     """Width and height, px."""
     sigma_px: NotNegative
     """Standard deviation of a detected corner in each axis, px."""
@@ -406,19 +416,16 @@ class CameraConfig(Section):
         return self.body.length_mm / 1000
 
 
-_Corners = Annotated[Count, Field(ge=3)]  # with fewer in a row no detector works
-
-
 class TargetConfig(Section):
     """The checkerboard on the passive arm."""
 
     kind: Literal["checkerboard"]
     """The pattern."""
-    corners: tuple[_Corners, _Corners]
-    """Rows and columns of inner corners, at least 3 each."""
+    corners: tuple[AtLeast3, AtLeast3]
+    """Rows and columns of inner corners, at least 3 each: with fewer no detector works."""
     square_mm: Positive
     """Side of a square, mm."""
-    feature_corner: tuple[Seed, Seed] | None = Field(default=None, validate_default=True)
+    feature_corner: tuple[Natural, Natural] | None = Field(default=None, validate_default=True)
     """Row and column of the feature point, from 0; the middlemost corner where left out and there is one."""
     margin_mm: NotNegative = 10.0
     """Width of the plate beyond the outer squares, mm."""
@@ -470,9 +477,9 @@ class NominalConfig(Section):
 class VerificationConfig(Section):
     """The poses that prove the result; the estimate does not use them."""
 
-    constraints: Annotated[Count, Field(ge=0)]
+    constraints: Natural
     """How many directions of the optical axis; 0 leaves the result unverified."""
-    positions: Annotated[Count, Field(ge=1)]
+    positions: AtLeast1
     """How many positions of the feature point on each axis."""
     limit_mm: Positive
     """Largest mean mismatch that passes, mm."""
@@ -504,15 +511,15 @@ def _above_zero(value: tuple[float, float]) -> tuple[float, float]:
 class ProcedureConfig(Section):
     """How poses are chosen, aligned and estimated from."""
 
-    seed: Seed
+    seed: Natural
     """Of the choice of poses."""
     method: Annotated[str, AfterValidator(_known_method), Field(json_schema_extra={"enum": list(METHODS)})]
     """The estimator."""
-    constraints: Annotated[Count, Field(ge=3)]
+    constraints: AtLeast3
     """How many directions of the optical axis."""
-    positions: Annotated[Count, Field(ge=3)]
+    positions: AtLeast3
     """How many positions of the feature point on each axis."""
-    first_looks: Annotated[Count, AfterValidator(_none_or_three)] = 5
+    first_looks: Annotated[Natural, AfterValidator(_none_or_three)] = 5
     """How many images to plan from, at least 3; 0 plans from the nominal transforms."""
     distance_mm: Annotated[Range, AfterValidator(_above_zero)]
     """Smallest and largest distance between camera and feature point, mm."""
@@ -578,7 +585,7 @@ class NoiseConfig(Section):
 class SimulationConfig(Section):
     """The simulated world; neither plan nor estimate may see it."""
 
-    seed: Seed
+    seed: Natural
     """Of the noise."""
     stepper: Literal["kinematic"]
     """What moves the simulated arms."""
@@ -653,14 +660,14 @@ def reference_problems(document: Mapping[str, Any]) -> Iterator[tuple[Location, 
         backend = _mapping(device).get("backend")
         if isinstance(backend, str) and backend not in backends:
             yield (*location, "backend"), f"no backend '{backend}' in this file; there are: {_names(backends)}"
+    if isinstance(document.get("robots"), Mapping) and len(robots) != 2:
+        yield ("robots",), f"must be two arms, one active and one passive, not {len(robots)}"
     yield from _role_problems(robots, camera.get("mount"))
     yield from _truth_problems(document, robots)
 
 
 def _role_problems(robots: Mapping[str, Any], mount: Any) -> Iterator[tuple[Location, str]]:
     roles = {name: _mapping(robot).get("role") for name, robot in robots.items()}
-    if robots and len(robots) != 2:
-        yield ("robots",), f"must be two arms, one active and one passive, not {len(robots)}"
     for role in ("active", "passive"):
         names = [name for name in roles if roles[name] == role]
         for name in names[1:]:

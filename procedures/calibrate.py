@@ -323,7 +323,7 @@ def requests_of(procedure: ProcedureConfig) -> list[Request]:
     return [request for request in requests if request.constraints]
 
 
-def captures_of(journal: Journal, cell_sha256: str, started: str) -> Captures:
+def captures_of(journal: Journal, cell_sha256: str, started: str | None) -> Captures:
     """The captures of a run so far, in the order taken; without those of constraints that were given up."""
     points = [(key, PointRecord.from_record(result)) for key, result in journal.results() if key.kind == "point"]
     given_up = {key.constraint for key, point in points if point.capture is None}

@@ -25,7 +25,7 @@ class RehearsedLook:
 
 @dataclass(frozen=True, eq=False)
 class Rehearsal:
-    """``stand_off`` is None where a cell takes no first look; ``plan`` is provisional, ``no_plan`` says why there is none."""
+    """``stand_off`` is None without first looks; ``plan`` is provisional, ``no_plan`` says why there is none."""
 
     stand_off: StandOff | None
     looks: tuple[RehearsedLook, ...]

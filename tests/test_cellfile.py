@@ -220,6 +220,11 @@ def test_an_accepted_rotation_matrix_is_made_exact(
     np.testing.assert_allclose(T[:3, :3], R, atol=1e-6)
 
 
+def test_a_number_may_be_written_with_or_without_a_point(path: Path) -> None:
+    text = changed(changed(CELL, "square_mm: 25", "square_mm: 25.0"), "constraints: 7", "constraints: 7.0")
+    assert load(path, text).cell == load(path, CELL).cell
+
+
 def test_an_even_board_has_the_feature_corner_that_was_named(path: Path) -> None:
     text = changed(CELL, "corners: [3, 5]", "corners: [4, 5]\n  feature_corner: [1, 2]")
     assert load(path, text).cell.target.board.feature == 7
@@ -257,6 +262,7 @@ BAD = {
     "a fraction for a count": (
         "constraints: 7", "constraints: 7.5", "7.5", "procedure.constraints: must be a whole number, not 7.5",
     ),
+    "a date for text": ("name: small", "name: 2020-01-02", "2020", "name: must be text, not 2020-01-02"),
     "a number for text": ("name: small", "name: 012", "012", "name: must be text, not 12"),
     "a number for a section": ("sim: {type: simulator}", "sim: 3", "3\n", "backends.sim: must be a mapping, not 3"),
     "a number for a list": ("[120, 90]", "120", "120", "robots.left.speed_deg_s: must be a list, not 120"),
@@ -479,6 +485,10 @@ def test_an_arm_has_at_least_one_joint(path: Path) -> None:
     assert refused(path, text) == [told]
 
 
+def test_no_arms_are_too_few(path: Path) -> None:
+    assert refused(path, CELL, "robots={}")[0] == ("--set robots: must be two arms, one active and one passive, not 0")
+
+
 @pytest.mark.parametrize("arms", [1, 3])
 def test_a_cell_has_two_arms(path: Path, arms: int) -> None:
     start, end = CELL.index("  right:"), CELL.index("camera:")
@@ -622,6 +632,12 @@ def test_a_text_with_settings_reads_back_as_the_same_cell(path: Path, home: floa
 def test_the_schema_beside_the_example_is_the_one_the_code_has() -> None:
     assert json.loads((PAPER.parent / "cell.schema.json").read_text()) == cell_schema()
     assert PAPER.read_text().startswith("# yaml-language-server: $schema=cell.schema.json\n")
+
+
+def test_the_schema_bounds_sizes_and_counts() -> None:
+    sections = cell_schema()["$defs"]
+    assert sections["TargetConfig"]["properties"]["square_mm"]["exclusiveMinimum"] == 0
+    assert sections["ProcedureConfig"]["properties"]["constraints"]["minimum"] == 3
 
 
 def test_every_number_in_the_schema_says_what_it_is_with_its_unit() -> None:

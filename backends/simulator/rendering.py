@@ -1,8 +1,7 @@
 """The camera's image of the checkerboard, without noise.
 
-Each pixel looks along its undistorted ray at the plane of the board. Edges are softened to the pixel's own
-width there, so the grey value is the mean over the pixel's area (for an oblique edge with a ramp of the same
-variance in place of a trapezoid); no supersampling is needed, at any distance.
+Each pixel looks along its undistorted ray at the plane of the board; its grey value is the mean over its area,
+in closed form where one edge crosses it and from parts of it where two do.
 """
 
 from __future__ import annotations
@@ -146,9 +145,11 @@ class _Stripes:
         """Parts of the chosen (n,) pixels as pixels of their own, (parts, n)."""
         offset = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
         v, u = (grid.reshape(-1, 1) for grid in np.meshgrid(offset, offset))
-        along_u, along_v = self.along_u[pixels], self.along_v[pixels]
-        position = self.position[pixels] + u * along_u + v * along_v
-        return _Stripes(position, along_u / _PARTS, along_v / _PARTS, self.squares)
+        position = self.position[pixels] + u * self.along_u[pixels] + v * self.along_v[pixels]
+        along_u, along_v = (
+            np.broadcast_to(along[pixels] / _PARTS, position.shape) for along in (self.along_u, self.along_v)
+        )
+        return _Stripes(position, along_u, along_v, self.squares)
 
     def within(self, margin: float) -> Array:
         """The share of each pixel that is inside the outer edges moved outwards by ``margin`` squares."""
@@ -165,12 +166,25 @@ class _Stripes:
         return 2.0 * self._share(0.5 - np.abs(in_pair - 1.0)) - 1.0
 
     def _share(self, distance: Array) -> Array:
-        """The share of each pixel on the inner side of an edge ``distance`` squares away from its centre."""
-        return np.asarray(np.clip(distance * self._pixels_per_square + 0.5, 0.0, 1.0))
+        """The share of each pixel on the inner side of an edge ``distance`` squares away from its centre.
+
+        Exact for a straight edge: a step, averaged over the pixel's width and over its height.
+        """
+        longer, shorter = self._spans
+        share = np.where(distance > 0.0, 1.0, 0.0)
+        edge = np.nonzero(2.0 * np.abs(distance) < longer + shorter)
+        d, p, q = distance[edge], longer[edge], shorter[edge]
+        beyond = 0.5 * (p - q) - np.abs(d)
+        tail = np.clip(beyond + q, 0.0, q) ** 2 / (2.0 * p * q) + np.maximum(beyond, 0.0) / p
+        share[edge] = np.where(d > 0.0, 1.0 - tail, tail)
+        return share
 
     @cached_property
-    def _pixels_per_square(self) -> Array:
-        return np.asarray(1.0 / np.sqrt(self.along_u * self.along_u + self.along_v * self.along_v))
+    def _spans(self) -> tuple[Array, Array]:
+        """How far the position runs along the pixel's two sides, the longer way first; never 0."""
+        u, v = np.abs(self.along_u), np.abs(self.along_v)
+        longer = np.maximum(u, v)
+        return longer, np.maximum(np.minimum(u, v), 1e-9 * longer)
 
 
 def project_rays(rays: Array, intrinsics: Intrinsics) -> Array:

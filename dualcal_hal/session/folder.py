@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dualcal_hal.camera import Image
 from dualcal_hal.errors import UsageError
-from dualcal_hal.session.files import write_atomically, write_document
+from dualcal_hal.session.files import read_document, write_atomically, write_document
 from dualcal_hal.session.journal import Journal
 
 
@@ -42,6 +44,10 @@ class Session:
     def result_path(self) -> Path:
         return self.folder / "result.json"
 
+    @property
+    def summary_path(self) -> Path:
+        return self.folder / "summary.png"
+
     def image_path(self, name: str) -> Path:
         """Where the image of a capture or look is kept."""
         return self.folder / "images" / f"{name.replace('/', '-')}.png"
@@ -52,6 +58,19 @@ class Session:
 
         _, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
         write_atomically(self.image_path(name), png.tobytes())
+
+    def read_image(self, name: str) -> Image:
+        """An image as it was stored; UsageError if it is not there."""
+        import cv2
+
+        image = cv2.imread(str(self.image_path(name)), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise UsageError(f"{self.image_path(name)}: there is no readable image")
+        return image.astype(np.uint8, copy=False)
+
+    def read_document(self, file_name: str, expected_format: str) -> dict[str, Any]:
+        """A JSON document of the session; FormatError if it is none of that format."""
+        return read_document(self.folder / file_name, expected_format)
 
     def write_document(self, file_name: str, document: dict[str, Any]) -> None:
         """Store a JSON document durably, all of it or nothing."""

@@ -12,6 +12,9 @@ from dualcal_hal.transforms import Array
 _TO_QUADRANT = 0.3
 """Squares from a corner to where its four squares are looked at."""
 
+_NEAR_ENDS = np.array([0.25, 0.75])
+_BOTH_SIDES = np.array([-1.0, 1.0])
+
 
 def sample(image: Image, pixels: Array) -> Array:
     """Grey values (...) at ``pixels`` (..., 2), bilinear; the image's edge goes on outside."""
@@ -19,8 +22,8 @@ def sample(image: Image, pixels: Array) -> Array:
     return np.asarray(map_coordinates(image, [y, x], order=1, mode="nearest", output=float))
 
 
-def contrast(image: Image, homography: Array, lattice: Array) -> tuple[Array, Array]:
-    """White minus black around each lattice point, and the mean of all around it: (n,), (n,) grey levels.
+def contrast(image: Image, homography: Array, lattice: Array) -> Array:
+    """White minus black around each lattice point, in grey levels (n,).
 
     homography: (3, 3) from lattice coordinates (column, row) to px; lattice: (n, 2). The contrast has one sign
     all over a checkerboard, halves at its rim and vanishes in expectation off it.
@@ -30,7 +33,27 @@ def contrast(image: Image, homography: Array, lattice: Array) -> tuple[Array, Ar
     pixels = np.asarray(cv2.perspectiveTransform(places, homography), dtype=float)
     grey = sample(image, pixels.reshape(-1, 4, 2))
     parity = 1.0 - 2.0 * (np.rint(lattice).sum(axis=1) % 2)
-    return parity * (grey @ np.array([0.5, 0.5, -0.5, -0.5])), grey.mean(axis=1)
+    return np.asarray(parity * (grey @ np.array([0.5, 0.5, -0.5, -0.5])))
+
+
+def gap(image: Image, grid: Array) -> float:
+    """How far the lines between the corners ``grid`` (rows, columns, 2) px are from the middle grey, at worst.
+
+    In parts of white minus black of the two squares beside the line: nothing where squares share an edge, a
+    half where dark spots with gaps between them pass for squares.
+    """
+    return max(_gap_along_rows(image, grid), _gap_along_rows(image, np.swapaxes(grid, 0, 1)))
+
+
+def _gap_along_rows(image: Image, grid: Array) -> float:
+    start, along = grid[1:-1, :-1], grid[1:-1, 1:] - grid[1:-1, :-1]
+    across = 0.5 * _TO_QUADRANT * (grid[2:, :-1] - grid[:-2, :-1])
+    on_edge = start[..., None, :] + _NEAR_ENDS[:, None] * along[..., None, :]
+    beside = start[..., None, :] + 0.5 * along[..., None, :] + _BOTH_SIDES[:, None] * across[..., None, :]
+    sides = sample(image, beside)
+    off = np.abs(sample(image, on_edge) - sides.mean(axis=-1, keepdims=True))
+    height = np.maximum(np.ptp(sides, axis=-1, keepdims=True), 1.0)
+    return float((off / height).max())
 
 
 def edge_blur(image: Image, grid: Array, spacing: float) -> float:

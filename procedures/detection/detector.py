@@ -13,7 +13,7 @@ from dualcal_hal.camera import Image
 from dualcal_hal.errors import UsageError
 from dualcal_hal.target import Checkerboard
 from dualcal_hal.transforms import Array
-from procedures.detection.appearance import contrast, edge_blur, sample
+from procedures.detection.appearance import contrast, edge_blur, gap
 from procedures.detection.saddle import MAX_MOVE, fit_saddles, half_window, reach
 
 BLUR_LIMIT = 3.0
@@ -24,8 +24,8 @@ PLANE_LIMIT = 0.3
 """px by which a corner may be off the homography of all, if the lens had no distortion ..."""
 DISTORTION_ALLOWANCE = 0.01
 """... and how much more in parts of the pattern's diagonal."""
-MIDDLE_LIMIT = 0.3
-"""How far a corner may be from the middle grey, in parts of its contrast: spots with gaps are a half away."""
+GAP_LIMIT = 0.4
+"""How far an edge may be from the middle grey, in parts of its contrast: spots with gaps are a half away."""
 GOES_ON_LIMIT = 0.75
 """Contrast one square outside the corners, in parts of that inside: a half at the rim of a pattern."""
 ALIKE_LIMIT = 0.75
@@ -207,17 +207,16 @@ class Detector:
 
     def _weakest_contrast(self, image: Image, grid: Array) -> float:
         """The contrast of the weakest corner, if black and white alternate over the pattern and no further."""
-        corners = grid.reshape(-1, 2)
-        homography = self._homography(corners)
-        inside, middle = contrast(image, homography, self._lattice)
+        homography = self._homography(grid.reshape(-1, 2))
+        inside = contrast(image, homography, self._lattice)
         inside *= np.sign(np.median(inside))
         weakest = float(inside.min())
         if weakest < CONTRAST_LIMIT:
             raise _Refused(Miss.NOT_FOUND, "the candidate's squares are not black and white in turn")
-        if np.any(np.abs(sample(image, corners) - middle) > MIDDLE_LIMIT * inside):
-            raise _Refused(Miss.NOT_FOUND, "the candidate's dark or bright spots do not touch at their corners")
-        outside, _ = contrast(image, homography, self._ring)
-        if abs(float(np.median(outside))) > GOES_ON_LIMIT * float(np.median(inside)):
+        if gap(image, grid) > GAP_LIMIT:
+            raise _Refused(Miss.NOT_FOUND, "the candidate's dark and bright parts do not meet like squares")
+        outside = abs(float(np.median(contrast(image, homography, self._ring))))
+        if outside > GOES_ON_LIMIT * float(np.median(inside)):
             raise _Refused(Miss.NOT_FOUND, "the checkerboard in the image has more corners than the target")
         return weakest
 

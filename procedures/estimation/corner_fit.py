@@ -22,9 +22,11 @@ from dualcal_hal.transforms import (
 )
 from procedures.estimation.projection import project, project_with_jacobian
 
-_STARTS = 4
+_STARTS = 3
+_COARSE_STEPS = 3
 _MOST_STEPS = 50
 _MOST_DAMPING = 1e8
+_SMALLEST_GAIN = 1e-4  # of the cost, a sum of squares in units of sigma
 
 
 @dataclass(frozen=True)
@@ -77,15 +79,15 @@ def fit_corners(
         sigma=pixel_sigma,
         prior=prior,
     )
-    starts = [(prior.T_P_A, prior.T_H_E)]
-    if board_poses is not None:
-        starts += _starts(views.T_A_H, np.asarray(T_P_T, dtype=float), board_poses, prior.T_H_E)
-    costs = [views.cost(*start) for start in starts]
-    best = np.argsort(costs, kind="stable")[:_STARTS]
-    fits = [_minimise(views, *starts[i]) for i in best if np.isfinite(costs[i])]
-    if not fits:
+    starts = np.stack([prior.T_P_A, *_starts(views.T_A_H, np.asarray(T_P_T, dtype=float), board_poses, prior.T_H_E)])
+    costs = views.cost(starts, prior.T_H_E)
+    promising = [i for i in np.argsort(costs, kind="stable")[:_STARTS] if np.isfinite(costs[i])]
+    if not promising:
         raise ValueError("from no start do all observed corners lie in front of the camera")
-    _, T_P_A, T_H_E = min(fits, key=lambda fit: fit[0])
+    # A few steps tell the minima apart; only the best one is worth the rest.
+    coarse = [_minimise(views, starts[i], prior.T_H_E, _COARSE_STEPS) for i in promising]
+    _, *best = min(coarse, key=lambda fit: fit[0])
+    _, T_P_A, T_H_E = _minimise(views, best[0], best[1], _MOST_STEPS)
     normal, _ = views.normal_equations(T_P_A, T_H_E)
     squares = views.squared_residuals(T_P_A, T_H_E)
     with np.errstate(invalid="ignore"):
@@ -116,14 +118,15 @@ class _Views:
         return np.asarray(np.isfinite(self.observed).all(axis=-1))
 
     def squared_residuals(self, T_P_A: Array, T_H_E: Array) -> Array:
-        """(k, n) squared distances in px, 0 for missing corners, inf for those not in front of the camera."""
+        """(..., k, n) squared distances in px, 0 for missing corners, inf for those not in front of the camera."""
         pixels = project(self._in_camera(T_P_A, T_H_E)[1], self.matrix, self.distortion)
         squares = np.sum((pixels - self.observed) ** 2, axis=-1)
         return np.where(self.seen, np.nan_to_num(squares, nan=np.inf), 0.0)
 
-    def cost(self, T_P_A: Array, T_H_E: Array) -> float:
-        misfit = np.sum(self.squared_residuals(T_P_A, T_H_E)) / self.sigma**2
-        return float(misfit + np.sum(self._deviation(T_P_A, T_H_E) ** 2))
+    def cost(self, T_P_A: Array, T_H_E: Array) -> Array:
+        """(...) for (..., 4, 4): squared residuals and deviation from the nominal in units of sigma."""
+        misfit = np.sum(self.squared_residuals(T_P_A, T_H_E), axis=(-2, -1)) / self.sigma**2
+        return np.asarray(misfit + np.sum(self._deviation(T_P_A, T_H_E) ** 2, axis=-1))
 
     def normal_equations(self, T_P_A: Array, T_H_E: Array) -> tuple[Array, Array]:
         """J^T J (12, 12) and J^T r (12,) of the whitened residuals, prior included."""
@@ -134,29 +137,32 @@ class _Views:
         J = np.concatenate([-J_active, J_active @ skew(in_active), -J_pixel, J_pixel @ skew(in_camera)], axis=-1)
         J = J[self.seen].reshape(-1, 12) / self.sigma
         r = (pixels - self.observed)[self.seen].ravel() / self.sigma
-        J_prior = self._deviation_jacobian(T_P_A, T_H_E)
+        deviation = self._deviation(T_P_A, T_H_E)
+        J_prior = self._deviation_jacobian(T_P_A, T_H_E, deviation)
         normal = J.T @ J + J_prior.T @ J_prior
-        return normal, J.T @ r + J_prior.T @ self._deviation(T_P_A, T_H_E)
+        return normal, J.T @ r + J_prior.T @ deviation
 
     def _in_camera(self, T_P_A: Array, T_H_E: Array) -> tuple[Array, Array]:
-        in_active = apply(inverse(T_P_A), self.points)
-        return in_active, apply(inverse(self.T_A_H @ T_H_E), in_active)
+        in_active = apply(inverse(T_P_A)[..., None, :, :], self.points)
+        return in_active, apply(inverse(self.T_A_H @ T_H_E[..., None, :, :]), in_active)
 
     def _deviation(self, T_P_A: Array, T_H_E: Array) -> Array:
-        """(12,) deviation from the nominal in the nominal child frames, in units of the prior's sigma."""
-        parts = []
-        for nominal, T in ((self.prior.T_P_A, T_P_A), (self.prior.T_H_E, T_H_E)):
-            relative = inverse(nominal) @ T
-            parts += [relative[:3, 3], vector_from_rotation(relative[:3, :3])]
-        return np.concatenate(parts) / self._sigmas
+        """(..., 12) deviation from the nominal in the nominal child frames, in units of the prior's sigma."""
+        relative = inverse(self._nominal) @ np.stack(np.broadcast_arrays(T_P_A, T_H_E), axis=-3)
+        parts = np.concatenate([relative[..., :3, 3], vector_from_rotation(relative[..., :3, :3])], axis=-1)
+        return parts.reshape(*parts.shape[:-2], 12) / self._sigmas
 
-    def _deviation_jacobian(self, T_P_A: Array, T_H_E: Array) -> Array:
+    def _deviation_jacobian(self, T_P_A: Array, T_H_E: Array, deviation: Array) -> Array:
         J = np.zeros((12, 12))
-        for at, nominal, T in ((0, self.prior.T_P_A, T_P_A), (6, self.prior.T_H_E, T_H_E)):
-            relative = nominal[:3, :3].T @ T[:3, :3]
-            J[at : at + 3, at : at + 3] = relative
-            J[at + 3 : at + 6, at + 3 : at + 6] = _log_jacobian(vector_from_rotation(relative))
+        turned = (deviation * self._sigmas).reshape(2, 6)[:, 3:]
+        for at, nominal, T, vector in zip((0, 6), self._nominal, (T_P_A, T_H_E), turned, strict=True):
+            J[at : at + 3, at : at + 3] = nominal[:3, :3].T @ T[:3, :3]
+            J[at + 3 : at + 6, at + 3 : at + 6] = _log_jacobian(vector)
         return J / self._sigmas[:, None]
+
+    @property
+    def _nominal(self) -> Array:
+        return np.stack([self.prior.T_P_A, self.prior.T_H_E])
 
     @property
     def _sigmas(self) -> Array:
@@ -164,23 +170,23 @@ class _Views:
 
 
 def _starts(
-    T_A_H: Array, T_P_T: Array, board_poses: Sequence[ArrayLike | None] | Array, T_H_E: Array
-) -> Iterator[tuple[Array, Array]]:
+    T_A_H: Array, T_P_T: Array, board_poses: Sequence[ArrayLike | None] | Array | None, T_H_E: Array
+) -> Iterator[Array]:
     # The hand-eye is the better known of the two: from its nominal, each seen board gives the bases.
-    for flange, target, poses in zip(T_A_H, T_P_T, board_poses, strict=True):
+    for flange, target, poses in zip(T_A_H, T_P_T, [] if board_poses is None else board_poses, strict=False):
         if poses is None:
             continue
         for T_E_T in np.asarray(poses, dtype=float).reshape(-1, 4, 4):
-            yield target @ inverse(flange @ T_H_E @ T_E_T), T_H_E
+            yield target @ inverse(flange @ T_H_E @ T_E_T)
 
 
-def _minimise(views: _Views, T_P_A: Array, T_H_E: Array) -> tuple[float, Array, Array]:
-    cost, damping = views.cost(T_P_A, T_H_E), 1e-3
+def _minimise(views: _Views, T_P_A: Array, T_H_E: Array, steps: int) -> tuple[float, Array, Array]:
+    cost, damping = float(views.cost(T_P_A, T_H_E)), 1e-3
     normal, gradient = views.normal_equations(T_P_A, T_H_E)
-    for _ in range(_MOST_STEPS):
+    for _ in range(steps):
         step = np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient), dtype=float)
         moved = T_P_A @ _exponential(step[:6]), T_H_E @ _exponential(step[6:])
-        moved_cost = views.cost(*moved)
+        moved_cost = float(views.cost(*moved))
         if not moved_cost < cost:
             damping *= 10
             if damping > _MOST_DAMPING:
@@ -188,7 +194,7 @@ def _minimise(views: _Views, T_P_A: Array, T_H_E: Array) -> tuple[float, Array, 
             continue
         gain, cost = cost - moved_cost, moved_cost
         (T_P_A, T_H_E), damping = moved, damping / 10
-        if gain < 1e-9 * (1 + cost):
+        if gain < _SMALLEST_GAIN:
             break
         normal, gradient = views.normal_equations(T_P_A, T_H_E)
     return cost, T_P_A, T_H_E

@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from dualcal_hal.robot import Joints
+from dualcal_hal.session.captures import Use
 from dualcal_hal.transforms import Array, vector_from_rotation
 
 PLAN_FORMAT = "dualcal.plan/1"
@@ -45,7 +46,7 @@ class PlannedConstraint:
     """One pose of the active arm, and positions to align with its optical axis, the farthest first."""
 
     name: str
-    use: str
+    use: Use
     active: Joints
     positions: tuple[PlannedPosition, ...]
 
@@ -75,7 +76,7 @@ class Plan:
     provisional: bool
     planned_from: str
 
-    def of(self, use: str) -> tuple[PlannedConstraint, ...]:
+    def of(self, use: Use) -> tuple[PlannedConstraint, ...]:
         """The constraints of one use."""
         return tuple(constraint for constraint in self.constraints if constraint.use == use)
 

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from dualcal_hal.errors import NoPlan
 from dualcal_hal.kinematics import random_joints
+from dualcal_hal.session.captures import Use
 from dualcal_hal.transforms import Array, Mask, inverse, skew
 from procedures.planning.belief import Belief
 from procedures.planning.model import ArmModel, CellModel, Posture
@@ -45,7 +46,7 @@ _POOL = 2.5  # candidates to choose from, per constraint wanted
 class Request:
     """How many constraints of a use, each with how many positions."""
 
-    use: str
+    use: Use
     constraints: int
     positions: int
     first_number: int = 0
@@ -344,7 +345,7 @@ def _most_informative(pool: list[_Candidate], count: int) -> list[_Candidate]:
     return chosen
 
 
-def _planned(candidate: _Candidate, name: str, use: str) -> PlannedConstraint:
+def _planned(candidate: _Candidate, name: str, use: Use) -> PlannedConstraint:
     positions = tuple(
         PlannedPosition(tuple(map(float, q)), float(d), float(t), float(c))
         for q, d, t, c in zip(candidate.passive, candidate.distance, candidate.tilt, candidate.clearance, strict=True)

@@ -23,6 +23,11 @@ class NominalErrors:
     dp_P_A: Array
     dp_H_E: Array
 
+    def __sub__(self, other: NominalErrors) -> NominalErrors:
+        return NominalErrors(
+            self.w - other.w, self.dz - other.dz, self.dp_P_A - other.dp_P_A, self.dp_H_E - other.dp_H_E
+        )
+
 
 def nominal_errors(T_P_A: Array, T_H_E: Array, nominal: NominalConfig) -> NominalErrors:
     """The errors that transforms (4, 4) show the nominal ones to have (paper, eqs. 19 and 21 to 23)."""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from dualcal_hal.config import CellConfig
+from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Mismatch, Result, TruthError
 from dualcal_hal.transforms import Array
 from procedures.planning.plan import Plan, PlannedConstraint
 from procedures.planning.ways import Leg
@@ -24,84 +23,63 @@ from procedures.report.nominal_errors import (
     nominal_errors,
 )
 
-BASE = "active_base_in_passive_base"
-CAMERA = "camera_in_active_flange"
-
 _NONE = "-"
 _STYLES = {"ok": "bold green", "fail": "bold red"}
 
 
-def result_tables(
-    cell: CellConfig, result: Mapping[str, Any], truth: Mapping[str, ArrayLike] | None = None
-) -> RenderableType:
-    """All there is to say about a result.
-
-    result: the content of ``result.json``; truth: ``{transform name: (4, 4), m}``, where it is known.
-    """
-    tables: list[RenderableType] = [error_table(cell, result, truth)]
-    if result["mismatch_mm"] is not None:
-        tables.append(mismatch_table(cell, result["mismatch_mm"]))
+def result_tables(cell: CellConfig, result: Result, truth: Mapping[str, Array] | None = None) -> Group:
+    """All there is to say about a result; truth: both transforms (4, 4) in m by their names, where they are known."""
+    tables = [error_table(cell, result, truth)]
+    if result.mismatch_before is not None and result.mismatch_after is not None:
+        tables.append(mismatch_table(cell, result.mismatch_before, result.mismatch_after))
     return Group(*tables, outcome(result))
 
 
-def error_table(
-    cell: CellConfig, result: Mapping[str, Any], truth: Mapping[str, ArrayLike] | None = None
-) -> Table:
+def error_table(cell: CellConfig, result: Result, truth: Mapping[str, Array] | None = None) -> Table:
     """What was wrong with the nominal transforms, as in the paper's Tables 3 and 4, beside the truth if it is known.
 
-    result, truth: see :func:`result_tables`. Below it the ``truth_error`` of the result, if it has one.
+    truth: as in :func:`result_tables`. Below come the result's own errors against the truth, if it states them.
     """
-    found = {name: np.array(result["transforms"][name]["matrix"]) for name in (BASE, CAMERA)}
-    paper = is_papers_cell(cell)
-    columns = {"found": _errors(found, cell)}
-    if truth is not None:
-        columns["truth"] = _errors({name: np.asarray(truth[name], dtype=float) for name in (BASE, CAMERA)}, cell)
-        columns["found - truth"] = _difference(columns["found"], columns["truth"])
-    if paper:
+    columns = {"found": nominal_errors(result.T_P_A, result.T_H_E, cell.nominal)}
+    if is_papers_cell(cell):
         columns = {"paper": PAPER_ERRORS, **columns}
+    if truth is not None:
+        columns["truth"] = nominal_errors(truth[T_P_A_NAME], truth[T_H_E_NAME], cell.nominal)
+        columns["found - truth"] = columns["found"] - columns["truth"]
 
-    kept = _shift_is_kept(result)
     table = _table("Errors of the nominal transforms (Tables 3 and 4)", "error", "unit", *columns)
-    for name, unit, axis, values in _error_rows(columns, found[CAMERA][:3, 2]):
-        mark = "*" if kept and axis else ""
-        table.add_row(name, unit, *(value + (mark if column == "found" else "") for column, value in values.items()))
-    if result["truth_error"] is not None:
+    for name, unit, values in _error_rows(columns):
+        table.add_row(name, unit, *values)
+    along = [f"{1e3 * errors.dp_H_E @ result.optical_axis:.2f}" for errors in columns.values()]
+    table.add_row("dp_H_E along the axis" + ("*" if _shift_is_kept(result) else ""), "mm", *along)
+    if result.truth_error is not None:
         table.add_section()
-        for name, unit, value in _truth_rows(result["truth_error"]):
+        for name, unit, value in _truth_rows(result.truth_error):
             table.add_row(name, unit, *[""] * (len(columns) - 1), value)
-    table.caption = _notes(result, kept, paper)
+    table.caption = _notes(cell, result)
     return table
 
 
-def mismatch_table(cell: CellConfig, mismatch_mm: Mapping[str, Mapping[str, float]]) -> Table:
-    """Mismatch on the verification captures before and after, as in the paper's Fig. 8.
-
-    mismatch_mm: of ``result.json``.
-    """
-    before, after = mismatch_mm["before"], mismatch_mm["after"]
+def mismatch_table(cell: CellConfig, before: Mismatch, after: Mismatch) -> Table:
+    """Mismatch on the verification captures with the nominal and the found transforms, as in the paper's Fig. 8."""
     headers = ["", "before", "after", "less by"]
     if is_papers_cell(cell):
         headers += ["paper before", "paper after", "less by"]
     table = _table("Mismatch on the verification captures, mm (Fig. 8)", *headers)
     for name in ("mean", "rms", "p95", "max"):
-        row = [name, f"{before[name]:.3f}", f"{after[name]:.3f}", _reduction(before[name], after[name])]
-        if is_papers_cell(cell):
-            row += _paper_mismatch(name)
-        table.add_row(*row)
+        old, new = 1e3 * getattr(before, name), 1e3 * getattr(after, name)
+        row = [name, f"{old:.3f}", f"{new:.3f}", _reduction(old, new)]
+        table.add_row(*row, *(_paper_mismatch(name) if is_papers_cell(cell) else ()))
     return table
 
 
-def outcome(result: Mapping[str, Any]) -> Text:
-    """The verdict with its reasons, and the captures that were left out.
-
-    result: the content of ``result.json``.
-    """
-    verdict = result["verdict"]
-    text = Text.assemble("Verdict: ", (verdict, _STYLES.get(verdict, "bold yellow")))
-    for reason in result["reasons"]:
+def outcome(result: Result) -> Text:
+    """The verdict with its reasons and warnings, and the captures that were left out."""
+    text = Text.assemble("Verdict: ", (result.verdict, _STYLES.get(result.verdict, "bold yellow")))
+    for reason in result.reasons:
         text.append(f"\n  {reason}")
-    for rejected in result["captures_rejected"]:
-        text.append(f"\n  left out {rejected['id']}: {rejected['reason']}")
+    for rejected in result.captures_rejected:
+        text.append(f"\n  left out {rejected.id}: {rejected.reason}")
     return text
 
 
@@ -137,50 +115,40 @@ def _table(title: str, *headers: str) -> Table:
 # -- errors ------------------------------------------------------------------------------------------------------------
 
 
-def _errors(transforms: Mapping[str, Array], cell: CellConfig) -> NominalErrors:
-    return nominal_errors(transforms[BASE], transforms[CAMERA], cell.nominal)
-
-
-def _difference(found: NominalErrors, truth: NominalErrors) -> NominalErrors:
-    return NominalErrors(
-        found.w - truth.w, found.dz - truth.dz, found.dp_P_A - truth.dp_P_A, found.dp_H_E - truth.dp_H_E
-    )
-
-
-def _error_rows(
-    columns: Mapping[str, NominalErrors], z_H_E: Array
-) -> Iterator[tuple[str, str, bool, dict[str, str]]]:
-    """Name, unit, whether it holds the shift along the optical axis, and the value for each column."""
-    for name, unit, scale, digits in (("w", "", 1, 4), ("dz", "", 1, 4), ("dp_P_A", "mm", 1e3, 2), ("dp_H_E", "mm", 1e3, 2)):
+def _error_rows(columns: Mapping[str, NominalErrors]) -> Iterator[tuple[str, str, list[str]]]:
+    """Name, unit, and the value for each column."""
+    for name, unit, scale, digits in (
+        ("w", "", 1.0, 4),
+        ("dz", "", 1.0, 4),
+        ("dp_P_A", "mm", 1e3, 2),
+        ("dp_H_E", "mm", 1e3, 2),
+    ):
         for i, letter in enumerate("xyz"):
-            values = {column: f"{scale * getattr(errors, name)[i]:.{digits}f}" for column, errors in columns.items()}
-            yield f"{name}_{letter}", unit, False, values
-    # The paper's own axis is in H too: its column is held against the axis found here.
-    along = {column: f"{1e3 * errors.dp_H_E @ z_H_E:.2f}" for column, errors in columns.items()}
-    yield "dp_H_E along the axis", "mm", True, along
+            values = [scale * getattr(errors, name)[i] for errors in columns.values()]
+            yield f"{name}_{letter}", unit, [f"{value:.{digits}f}" for value in values]
 
 
-def _truth_rows(truth_error: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
-    base, camera = truth_error[BASE], truth_error[CAMERA]
-    yield "T_P_A rotation", "deg", f"{base['rotation_deg']:.4f}"
-    yield "T_P_A translation", "mm", f"{base['translation_mm']:.3f}"
-    yield "optical axis direction", "deg", f"{camera['axis_deg']:.4f}"
-    yield "camera across the axis", "mm", f"{camera['sideways_mm']:.3f}"
+def _truth_rows(error: TruthError) -> Iterator[tuple[str, str, str]]:
+    yield "T_P_A rotation", "deg", f"{np.degrees(error.base_rotation):.4f}"
+    yield "T_P_A translation", "mm", f"{1e3 * error.base_translation:.3f}"
+    yield "optical axis direction", "deg", f"{np.degrees(error.camera_axis):.4f}"
+    yield "camera across the axis", "mm", f"{1e3 * error.camera_sideways:.3f}"
 
 
-def _shift_is_kept(result: Mapping[str, Any]) -> bool:
+def _shift_is_kept(result: Result) -> bool:
     """Whether the camera's shift along its axis is the nominal one by construction."""
-    return any(entry["of"] == CAMERA and any(entry["direction"][:3]) for entry in result["unobservable"])
+    return any(entry.of == T_H_E_NAME and any(entry.direction[:3]) for entry in result.unobservable)
 
 
-def _notes(result: Mapping[str, Any], kept: bool, paper: bool) -> Text:
+def _notes(cell: CellConfig, result: Result) -> Text:
     notes = ["w: axis times sine of the angle; dz: difference of unit vectors."]
-    if kept:
-        notes.append("* not observable: nominal by construction, and part of dp_H_E x, y, z above.")
-    if paper:
-        z = np.array([0.0, 0.0, 1.0]) + PAPER_ERRORS.dz
-        x, y, z = z / np.linalg.norm(z) - [0.0, 0.0, 1.0]
-        notes.append(f"The paper's dz is as printed; as a difference of unit vectors: {x:.4f} {y:.4f} {z:.4f}.")
+    if is_papers_cell(cell):
+        nominal = np.array([0.0, 0.0, 1.0])
+        axis = nominal + PAPER_ERRORS.dz
+        x, y, z = axis / np.linalg.norm(axis) - nominal
+        notes.append(f"The paper's dz is as printed; as a difference of unit vectors {x:.4f} {y:.4f} {z:.4f}.")
+    if _shift_is_kept(result):
+        notes.append("* Not observable, nominal by construction; it is part of dp_H_E x, y and z.")
     return Text("\n".join(notes))
 
 

@@ -1,4 +1,4 @@
-"""The `dualcal` command line. Heavy libraries are imported when a command needs them, so that --help answers at once."""
+"""The `dualcal` command line. Heavy imports wait until a command needs them: --help answers at once."""
 
 from tools.cli.app import main
 

@@ -39,7 +39,9 @@ def run(
     seed: Annotated[int | None, typer.Option(help="Sets procedure.seed and simulation.seed.")] = None,
     method: Method = None,
     overrides: Set = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show stand-off, looks and a provisional plan only.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show stand-off, looks and a provisional plan only.")
+    ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Move without asking, on a cell that is not simulated.")] = False,
     json: Json = False,
 ) -> None:
@@ -62,7 +64,6 @@ def estimate(
     method: Method = None,
     truth: Annotated[Path | None, typer.Option(help="JSON {transform name: 4x4, m} to compare with.")] = None,
     out: Annotated[Path | None, typer.Option(help="Where to write the result (JSON).")] = None,
-    overrides: Set = None,
     json: Json = False,
 ) -> None:
     """Estimate and verify from captures, without any device.
@@ -72,7 +73,7 @@ def estimate(
     with reported():
         from tools.cli.estimate import EstimateOptions, estimate_captures
 
-        estimate_captures(EstimateOptions(captures, cell, method, truth, out, tuple(overrides or ()), json))
+        estimate_captures(EstimateOptions(captures, cell, method, truth, out, json))
 
 
 @app.command()

@@ -14,17 +14,22 @@ from dualcal_hal.clock import utc_now
 from dualcal_hal.errors import UsageError
 from dualcal_hal.guard import Placement
 from dualcal_hal.registry import backend_class
-from dualcal_hal.session.captures import write_captures
+from dualcal_hal.session.captures import Captures, write_captures
 from dualcal_hal.session.folder import Session
+from dualcal_hal.session.result import Result, with_truth_error, write_result
 from procedures.alignment import largest_alignment_error, tolerance_px
+from procedures.analysis import analyse
 from procedures.calibrate import Calibration, captures_of
 from procedures.engine import Engine
 from procedures.observers import Observers
 from procedures.planning.model import CellModel
+from procedures.planning.plan import PLAN_FORMAT, Plan
 from procedures.rehearsal import rehearse
+from procedures.report import draw_summary
 from tools.cli.exits import FAULT, aborting_with
 from tools.cli.progress import progress
-from tools.cli.show import finish, show_rehearsal
+from tools.cli.show import show_rehearsal, show_result
+from tools.cli.truth import simulated_truth
 
 
 @dataclass(frozen=True)
@@ -61,7 +66,9 @@ def run_cell(options: RunOptions) -> int:
     finally:
         captures = captures_of(session.journal, file.sha256, started.isoformat(timespec="seconds"))
         write_captures(session.captures_path, captures)
-    result = finish(console, file, session, captures, as_json=options.json)
+    result = _conclude(file, session, captures)
+    show_result(console, file.cell, result, simulated_truth(file), as_json=options.json)
+    console.print(f"session: {session.folder}", soft_wrap=True, highlight=False)
     return 0 if result.verdict == "ok" else FAULT
 
 
@@ -76,9 +83,7 @@ def _load(options: RunOptions) -> CellFile:
     return load_cell(options.cell, overrides)
 
 
-def _execute(
-    file: CellFile, model: CellModel, calibration: Calibration, session: Session, console: Console
-) -> None:
+def _execute(file: CellFile, model: CellModel, calibration: Calibration, session: Session, console: Console) -> None:
     placement = Placement(model.geometry(model.nominal), model.nominal.T_P_A)
     try:
         with (
@@ -92,6 +97,26 @@ def _execute(
     except Exception as error:
         error.add_note(f"the arms were stopped; what was captured is in {session.folder}")
         raise
+
+
+def _conclude(file: CellFile, session: Session, captures: Captures) -> Result:
+    """Analyse, and only then compare with the truth where there is one; write both and the picture."""
+    result = analyse(captures, file.cell, file.cell.procedure.method)
+    truth = simulated_truth(file)
+    if truth is not None:
+        result = with_truth_error(result, truth)
+    write_result(session.result_path, result)
+    shown = captures.captures[0]
+    draw_summary(
+        session.summary_path,
+        cell=file.cell,
+        plan=Plan.from_record(session.read_document("plan.json", PLAN_FORMAT)),
+        captures=captures,
+        result=result,
+        image=session.read_image(shown.id),
+        feature_px=shown.feature,
+    )
+    return result
 
 
 def _confirm(file: CellFile, yes: bool) -> None:

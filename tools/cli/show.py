@@ -1,0 +1,49 @@
+"""What a command puts on the screen."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+import typer
+from rich.console import Console
+
+from dualcal_hal.config import CellConfig
+from dualcal_hal.session.result import Result
+from dualcal_hal.transforms import Array
+from procedures.rehearsal import Rehearsal
+from procedures.report import plan_table, result_tables, way_table
+
+
+def show_result(
+    console: Console, cell: CellConfig, result: Result, truth: Mapping[str, Array] | None, *, as_json: bool
+) -> None:
+    """Tables for a person, or the document alone for a program."""
+    if as_json:
+        typer.echo(json.dumps(result.to_document(), indent=1, allow_nan=False))
+    else:
+        console.print(result_tables(cell, result, truth))
+
+
+def show_rehearsal(console: Console, cell: CellConfig, rehearsal: Rehearsal) -> None:
+    """The way to the stand-off, the looks and the provisional plan."""
+    console.print(f"Dry run of cell '{cell.name}': no device is opened.")
+    if rehearsal.stand_off is not None:
+        stand_off = rehearsal.stand_off
+        console.print(
+            f"\nFrom home to the stand-off: camera and target {stand_off.distance * 1e3:.0f} mm apart, "
+            f"{stand_off.clearance * 1e3:.0f} mm clear of each other, by the nominal transforms"
+        )
+        console.print(way_table(stand_off.way))
+        for number, taken in enumerate(rehearsal.looks, start=1):
+            console.print(
+                f"Look {number} of {len(rehearsal.looks)}" + ("" if taken.way else ", from where the arms stand")
+            )
+            if taken.way:
+                console.print(way_table(taken.way))
+    if rehearsal.plan is None:
+        console.print(f"There is no provisional plan from the nominal transforms ({rehearsal.no_plan}).")
+        console.print("The run plans after its looks, with better transforms.")
+        return
+    console.print("Provisional: the run plans anew after its looks." if rehearsal.stand_off else "From the nominal:")
+    console.print(plan_table(rehearsal.plan))

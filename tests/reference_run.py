@@ -26,11 +26,15 @@ def cell() -> CellConfig:
 
 @cache
 def captures() -> Captures:
-    """The reference captures with joint readings that miss by 0.1 mrad."""
+    """The reference captures with the passive arm's readings off by 0.1 mrad and the features by up to 0.1 px."""
     rng = np.random.default_rng(1)
     exact = read_captures(REFERENCE)
     noisy = [
-        replace(capture, passive_joints=tuple((capture.passive_joints + rng.normal(0, 1e-4, 6)).tolist()))
+        replace(
+            capture,
+            passive_joints=tuple((capture.passive_joints + rng.normal(0, 1e-4, 6)).tolist()),
+            feature=tuple((capture.feature + rng.uniform(-0.1, 0.1, 2)).tolist()),
+        )
         for capture in exact.captures
     ]
     return replace(exact, captures=tuple(noisy))

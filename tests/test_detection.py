@@ -223,7 +223,9 @@ def test_a_grid_of_dark_spots_is_no_checkerboard(detector: Detector, monkeypatch
     image = cv2.GaussianBlur(image, (0, 0), 0.6)
     between = [(477 + 30 * (j + i), 407 + 30 * (i - j)) for i in range(3) for j in range(3)]
     monkeypatch.setattr(cv2, "findChessboardCorners", lambda image, size, flags: (True, np.array(between, dtype=float)))
-    assert missed(detector.detect(image)).reason is Miss.NOT_FOUND
+    outcome = missed(detector.detect(image))
+    assert outcome.reason is Miss.NOT_FOUND
+    assert "meet like squares" in outcome.detail
 
 
 def test_a_larger_checkerboard_is_not_taken_for_a_part_of_it(

@@ -29,6 +29,7 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._results: dict[StepKey, dict[str, Any]] = {}
+        self._length = 0
         if path.exists():
             self._read()
         else:
@@ -50,23 +51,29 @@ class Journal:
         self._results[key] = result
 
     def _write_line(self, content: dict[str, Any]) -> None:
-        with self._path.open("ab") as file:
+        with self._path.open("r+b" if self._path.exists() else "xb") as file:
+            # A line that a crash has cut off was never finished: it gives way.
+            file.truncate(self._length)
+            file.seek(self._length)
             file.write(json.dumps(content, allow_nan=False).encode() + b"\n")
             file.flush()
             os.fsync(file.fileno())
+            self._length = file.tell()
 
     def _read(self) -> None:
         # What follows the last newline is a line that was cut off in the writing: its step is not finished.
-        lines = self._path.read_bytes().split(b"\n")[:-1]
+        content = self._path.read_bytes()
+        self._length = content.rfind(b"\n") + 1
+        lines = content[: self._length].split(b"\n")[:-1]
         problems = []
         for number, line in enumerate(lines, start=1):
             try:
-                content = json.loads(line)
+                entry = json.loads(line)
                 if number == 1:
-                    if content["format"] != JOURNAL_FORMAT:
-                        raise ValueError(f"unknown format {content['format']!r}, expected {JOURNAL_FORMAT!r}")
+                    if entry["format"] != JOURNAL_FORMAT:
+                        raise ValueError(f"unknown format {entry['format']!r}, expected {JOURNAL_FORMAT!r}")
                     continue
-                self._results[StepKey(**content["step"])] = content["result"]
+                self._results[StepKey(**entry["step"])] = entry["result"]
             except (ValueError, KeyError, TypeError) as error:
                 problems.append(Problem(f"{self._path}:{number}", f"not a line of a journal: {error}"))
         if problems:

@@ -32,10 +32,10 @@ def draw_frame(
 ) -> None:
     """The frame of the capture ``shown`` about the optical axis, and beside it how far each capture is from it."""
     panel = host(figure, place)
-    board, offsets = place.subgridspec(1, 2, wspace=0.28)
+    halves = place.subgridspec(1, 2, wspace=0.28)
     centre = cell.camera.intrinsics.principal_point
-    _draw_board(figure.add_subplot(board), image, shown, centre)
-    _draw_offsets(figure.add_subplot(offsets), cell, captures, shown, centre)
+    _draw_board(figure.add_subplot(halves[0]), image, shown, centre)
+    _draw_offsets(figure.add_subplot(halves[1]), cell, captures, shown, centre)
     for name, colour, _ in _CIRCLES:
         panel.plot([], [], "o", color=colour, fillstyle="none", markersize=11, markeredgewidth=2.5, label=name)
     panel.plot([], [], ".", color=BLUE, markersize=8, label="corners")

@@ -55,6 +55,95 @@ def draw_scene(
         _draw_points(axes, planned, f"planned ({len(planned)})", "none", BLUE, 80)
     _draw_points(axes, reached, f"reached ({len(reached)}){_distance(planned, reached)}", RED, RED, 14)
     _finish(axes)
-    for handle, words in zip(*axes.get_legend_handles_labels(), strict=True):
-        handle.set_label(words)
-    head(panel, "Cell in the passive base P, by the transforms found", *axes.get_legend_handles_labels())
+    head(panel, "Cell in the passive base P, placed by the transforms found", axes)
+
+
+def feature_point(cell: CellConfig, joints: Joints) -> Array:
+    """(3,) m in P at the passive arm's joint angles (rad)."""
+    passive = cell.passive
+    return np.asarray((passive.chain.forward(joints) @ passive.target_mount_transform)[:3, 3])
+
+
+def _planned(cell: CellConfig, plan: Plan) -> Positions:
+    return {
+        (constraint.name, number): feature_point(cell, position.passive)
+        for constraint in plan.constraints
+        for number, position in enumerate(constraint.positions)
+    }
+
+
+def _distance(planned: Positions, reached: Positions) -> str:
+    both = planned.keys() & reached.keys()
+    if not both:
+        return ""
+    mean = np.mean([np.linalg.norm(planned[key] - reached[key]) for key in both])
+    return f", on average {1e3 * mean:.1f} mm from there"
+
+
+def _draw_points(axes: Axes3D, points: Positions, words: str, face: str, edge: str, size: float) -> None:
+    x, y, z = _mm(list(points.values())).T
+    axes.scatter(x, y, z, s=size, facecolors=face, edgecolors=edge, linewidths=1.6, depthshade=False, label=words)
+
+
+def _draw_axes(
+    axes: Axes3D, cell: CellConfig, captures: Sequence[CaptureRecord], result: Result, reached: Positions
+) -> None:
+    """The optical axis of each constraint, from the camera to a little beyond the farthest feature point."""
+    first = {capture.constraint: capture for capture in reversed(captures)}
+    for number, (constraint, capture) in enumerate(first.items()):
+        T_P_E = result.T_P_A @ cell.active.chain.forward(capture.active_joints) @ result.T_H_E
+        camera, axis = T_P_E[:3, 3], T_P_E[:3, 2]
+        farthest = max((point - camera) @ axis for (name, _), point in reached.items() if name == constraint)
+        x, y, z = _mm([camera, camera + _BEYOND * farthest * axis]).T
+        words = "optical axes, from the camera" if number == 0 else None
+        axes.plot(x, y, z, color=GREEN, linewidth=1.4, marker="s", markersize=4, markevery=[0], label=words)
+
+
+def _draw_arms(axes: Axes3D, cell: CellConfig, result: Result, shown: CaptureRecord) -> None:
+    """Both arms with what they carry, as at a capture: the camera with its field of view, the target's outline."""
+    T_P_E = result.T_P_A @ cell.active.chain.forward(shown.active_joints) @ result.T_H_E
+    T_P_T = cell.passive.chain.forward(shown.passive_joints) @ cell.passive.target_mount_transform
+    active = apply(result.T_P_A, _course(cell.active.chain, shown.active_joints))
+    passive = _course(cell.passive.chain, shown.passive_joints)
+    outline = cell.target.board.outline
+    for base, words, course, tool, colour in (
+        ("A", f"active arm ({cell.active_name})", active, apply(T_P_E, _field_of_view(cell)), ORANGE),
+        ("P", f"passive arm ({cell.passive_name})", passive, apply(T_P_T, outline[[0, 1, 2, 3, 0]]), DARK),
+    ):
+        x, y, z = _mm(course).T
+        axes.plot(x, y, z, color=colour, linewidth=4, marker="o", markersize=5, label=words)
+        axes.text(x[0], y[0], z[0] - 90, base, fontsize=TEXT + 1, weight="bold", color=colour, ha="center")
+        x, y, z = _mm(tool).T
+        axes.plot(x, y, z, color=colour, linewidth=1.5)
+
+
+def _course(chain: Chain, q: Joints) -> Array:
+    """Corners (k, 3) of the arm in its base, m: along each joint's axis by d, then to the next frame's origin."""
+    frames = chain.frames(q)
+    points = [frames[0, :3, 3]]
+    for row, before, after in zip(chain.rows, frames[:-1], frames[1:], strict=True):
+        points += [before[:3, 3] + row.d * before[:3, 2], after[:3, 3]]
+    return np.array(points)
+
+
+def _field_of_view(cell: CellConfig) -> Array:
+    """A line (k, 3) in E, m, about the pyramid that the camera sees."""
+    width, height = cell.camera.size_px
+    pixels = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]])
+    rays = _FRUSTUM * pixels @ np.linalg.inv(cell.camera.intrinsics.matrix).T
+    eye = np.zeros(3)
+    return np.array([eye, rays[0], rays[1], eye, rays[2], rays[3], eye, rays[3], rays[0], rays[1], rays[2]])
+
+
+def _mm(points: ArrayLike) -> Array:
+    return np.asarray(1e3 * np.asarray(points))
+
+
+def _finish(axes: Axes3D) -> None:
+    axes.set_aspect("equal")
+    axes.set_box_aspect([np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())], zoom=1.15)
+    axes.view_init(elev=22, azim=-72)
+    axes.set_xlabel("x, mm", fontsize=TEXT, labelpad=10)
+    axes.set_ylabel("y, mm", fontsize=TEXT, labelpad=6)
+    axes.set_zlabel("z, mm", fontsize=TEXT)
+    axes.tick_params(labelsize=TEXT - 2)

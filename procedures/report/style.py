@@ -23,10 +23,13 @@ TEXT = 12.0
 """Size of ordinary text, points."""
 
 
-def head(axes: Axes, title: str) -> None:
-    """A panel's title and, below it and outside the panel, where it can hide no data, a legend in two lines."""
+def head(axes: Axes, title: str, drawn: Axes | None = None) -> None:
+    """A panel's title and, below it and outside the panel, where it can hide no data, a legend in two lines.
+
+    drawn: where the things that the legend names are, if not in ``axes``.
+    """
     axes.set_title(title, loc="left", fontsize=TEXT + 3, weight="bold", color=DARK, pad=46)
-    handles, labels = axes.get_legend_handles_labels()
+    handles, labels = (drawn or axes).get_legend_handles_labels()
     axes.legend(
         handles,
         labels,

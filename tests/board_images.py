@@ -11,6 +11,7 @@ from dualcal_hal.target import Checkerboard
 from dualcal_hal.transforms import Array, rotation_from_vector, transform
 
 MARGIN = 0.6  # squares of white around the pattern
+NOISE = 2.0  # grey levels
 FACING = np.diag([1.0, -1.0, -1.0])  # R_E_T of a board seen straight from the front, upright
 
 
@@ -34,54 +35,37 @@ def random_view(
     rng: np.random.Generator,
     board: Checkerboard,
     camera: Intrinsics,
-    distance: tuple[float, float] = (0.3, 0.5),
 ) -> Array:
-    """T_E_T (4, 4) with tilt up to 45 deg and the pattern with a quarter of a square around it in the image."""
+    """T_E_T (4, 4) at 0.3 to 0.5 m, tilted by up to 45 deg, with the pattern and a rim in view."""
     rim = board.outline + 0.25 * board.square * np.sign(board.outline - board.outline.mean(axis=0))
     while True:
         tilt_axis = rng.uniform(-np.pi, np.pi)
         tilt = np.deg2rad(rng.uniform(0.0, 45.0)) * np.array([np.cos(tilt_axis), np.sin(tilt_axis), 0.0])
         R = rotation_from_vector([0.0, 0.0, rng.uniform(-np.pi, np.pi)]) @ rotation_from_vector(tilt) @ FACING
         direction = np.array([*rng.uniform(-0.6, 0.6, 2), 1.0])
-        T_E_T = transform(R, rng.uniform(*distance) * direction)
+        T_E_T = transform(R, rng.uniform(0.3, 0.5) * direction)
         pixels = project(board, camera, T_E_T, rim)
         if np.all(pixels > 0) and np.all(pixels < np.array(camera.size) - 1):
             return T_E_T
 
 
 class Scene:
-    """Images of one board by one camera, with noise in grey levels from ``rng``.
+    """Images of one board by one camera, with noise in grey levels from ``rng``."""
 
-    ``subpixels`` in each direction are rendered and averaged where corners are held against the truth.
-    """
-
-    def __init__(
-        self,
-        board: Checkerboard,
-        camera: Intrinsics,
-        rng: np.random.Generator,
-        blur: float = 0.6,
-        noise: float = 2.0,
-        subpixels: int = 1,
-    ) -> None:
-        self._board, self._camera, self._rng, self._noise = board, camera, rng, noise
-        matrix = camera.matrix.copy()
-        matrix[:2] *= subpixels
-        matrix[:2, 2] += (subpixels - 1) / 2
-        width, height = camera.size
-        fine = Intrinsics(matrix, camera.distortion, (subpixels * width, subpixels * height))
-        self._renderer = Renderer(board, MARGIN * board.square, fine, subpixels * blur)
+    def __init__(self, board: Checkerboard, camera: Intrinsics, rng: np.random.Generator, blur: float = 0.6) -> None:
+        self._board, self._camera, self._rng = board, camera, rng
+        self._renderer = Renderer(board, MARGIN * board.square, camera, blur)
 
     def image(self, T_E_T: Array, background: Image | None = None) -> Image:
         """The board at ``T_E_T``, in front of ``background`` if there is one."""
-        grey = cv2.resize(self._renderer.render(T_E_T), self._camera.size, interpolation=cv2.INTER_AREA)
+        grey = self._renderer.render(T_E_T)
         if background is not None:
             outwards = np.sign(self._board.outline - self._board.outline.mean(axis=0))
             plate = self._board.outline + (MARGIN - 0.1) * self._board.square * outwards
             outline = np.rint(project(self._board, self._camera, T_E_T, plate)).astype(np.int32)
             on_plate = cv2.fillConvexPoly(np.zeros(grey.shape, np.uint8), outline, 1)
             grey = np.where(on_plate, grey, background)
-        noisy = grey + self._noise * self._rng.standard_normal(grey.shape, dtype=np.float32)
+        noisy = grey + NOISE * self._rng.standard_normal(grey.shape, dtype=np.float32)
         return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 

@@ -50,7 +50,7 @@ def rolled(pixels: Array, roll: float, scale: float = 1.0, shift: tuple[float, f
 def errors_over_views(count: int, seed: int) -> Array:
     """(9 count, 2) px: detected minus true corners over random distorted views."""
     rng = np.random.default_rng(seed)
-    scene, detector = Scene(BOARD, CAMERA, rng, subpixels=2), Detector(BOARD, CAMERA.size)
+    scene, detector = Scene(BOARD, CAMERA, rng), Detector(BOARD, CAMERA.size)
     errors = []
     for _ in range(count):
         T_E_T = random_view(rng, BOARD, CAMERA)

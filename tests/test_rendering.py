@@ -93,9 +93,8 @@ def test_grey_values_are_means_over_each_pixels_area(distance: float) -> None:
     mean = exact.reshape(SMALL.size[1], fine, SMALL.size[0], fine).mean(axis=(1, 3))
     difference = coarse - mean
     contrast = WHITE - BLACK
-    assert np.abs(difference).max() < 0.12 * contrast
-    assert np.sqrt(np.mean(difference[np.abs(difference) > 0.01] ** 2)) < 0.03 * contrast
-    assert abs(difference.mean()) < 1e-3 * contrast
+    assert np.abs(difference).max() < 0.03 * contrast
+    assert np.sqrt(np.mean(difference**2)) < 1e-3 * contrast
 
 
 def test_the_top_left_square_is_black_and_colours_alternate(renderer: Renderer) -> None:
@@ -106,7 +105,8 @@ def test_the_top_left_square_is_black_and_colours_alternate(renderer: Renderer) 
     u, v = np.rint(project(centres, T_E_T)).astype(int).T
     expected = np.where((i + j).ravel() % 2 == 0, BLACK, WHITE)
     np.testing.assert_allclose(image[v, u], expected, atol=1e-3)
-    margin = np.rint(project(BOARD.outline[:1] + [-0.005, 0.005, 0.0], T_E_T)).astype(int)[0]
+    in_margin = BOARD.outline[:1] + np.array([-0.005, 0.005, 0.0])
+    margin = np.rint(project(in_margin, T_E_T)).astype(int)[0]
     assert image[margin[1], margin[0]] == pytest.approx(WHITE)
 
 
@@ -138,7 +138,7 @@ def test_a_board_that_cannot_be_seen_is_not_drawn(renderer: Renderer, what: str,
     [
         ([0.0, 0.0, 0.3], [0.24, 0.1, 0.4]),  # over the right edge
         ([0.0, 0.0, 0.0], [0.0, 0.0, 0.03]),  # fills the image
-        ([1.5, 0.0, 0.0], [0.0, 0.05, 0.05]),  # seen flat, and partly behind the camera
+        ([-1.2, 0.0, 0.0], [0.0, 0.02, 0.03]),  # seen flat, and partly behind the camera
         ([0.0, 1.3, 0.0], [0.1, 0.0, 0.3]),  # seen flat
     ],
 )

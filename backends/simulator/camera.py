@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from backends.simulator.noise import normal_image
-from backends.simulator.rendering import GreyImage, Renderer
+from backends.simulator.rendering import Renderer, Values
 from backends.simulator.world import World
 from dualcal_hal.camera import Camera, Frame, Image
 from dualcal_hal.errors import CommandRefused, DeviceTimeout, NotOpen
@@ -49,7 +49,7 @@ class SimulatedCamera(Camera):
             raise NotOpen(self.name, "grab", "it was closed meanwhile", "open its backend again")
 
 
-def _exposed(image: GreyImage, source: np.random.Generator, sigma: float) -> Image:
+def _exposed(image: Values, source: np.random.Generator, sigma: float) -> Image:
     """The grey values with noise, rounded to 8 bits; read-only."""
     noise = normal_image(source, image.shape)
     exposed = np.asarray(cv2.addWeighted(image, 1.0, noise, sigma, 0.0, dtype=cv2.CV_8U), dtype=np.uint8)

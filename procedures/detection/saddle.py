@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dualcal_hal.camera import Image
@@ -55,7 +56,7 @@ def fit_saddles(image: Image, start: Array, half: int) -> Saddles:
     quadratic = _quadratic_fit(half)
     points, found = start.copy(), np.ones(len(start), dtype=bool)
     for _ in range(_MAX_ITERATIONS):
-        step, is_saddle = _newton_step(patches, points - base, taps, half, quadratic)
+        step, is_saddle = _newton_step(patches, points - base, half, quadratic)
         points[found] += step[found]
         found &= is_saddle & (np.abs(points - start).max(axis=1) <= MAX_MOVE)
         settled = np.abs(step).max(axis=1) < _SETTLED
@@ -70,15 +71,15 @@ def _quadratic_fit(half: int) -> Array:
     return np.linalg.pinv(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1))
 
 
-def _newton_step(
-    patches: Array, centres: Array, taps: NDArray[np.int_], half: int, quadratic: Array
-) -> tuple[Array, NDArray[np.bool_]]:
+def _newton_step(patches: Array, centres: Array, half: int, quadratic: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Steps (n, 2) from the windows' centres (n, 2) to the fitted quadratics' stationary points, and whether
     these are saddles (n,)."""
-    sigma = BLUR_PER_WINDOW * half
-    places = centres[:, :, None, None] + np.arange(-half, half + 1)[:, None]
-    kernels = np.exp(-0.5 * ((taps - places) / sigma) ** 2)
-    kernels /= kernels.sum(axis=-1, keepdims=True)
+    taps = patches.shape[-1]
+    offsets = np.arange(taps + 2 * half) - (taps // 2 + half)
+    gaussian = np.exp(-0.5 * ((offsets - centres[:, :, None]) / (BLUR_PER_WINDOW * half)) ** 2)
+    gaussian /= gaussian.sum(axis=-1, keepdims=True)
+    # Contiguous, for the products below take twice as long on views.
+    kernels = np.ascontiguousarray(sliding_window_view(gaussian, taps, axis=-1)[:, :, ::-1])
     windows = kernels[:, 1] @ patches @ np.swapaxes(kernels[:, 0], 1, 2)
     _, gx, gy, xx, xy, yy = quadratic @ windows.reshape(len(centres), -1).T
     determinant = 4.0 * xx * yy - xy * xy

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dualcal_hal.transforms import Array, nearest_rotation, rotation_angle, smallest_rotation, transform
+from dualcal_hal.transforms import Array, nearest_rotation, smallest_rotation, transform
 from procedures.estimation.degenerate import Degenerate
 from procedures.estimation.line import fit_line
 from procedures.estimation.rotation import Iteration, estimate_rotation, rotation_singular_values
@@ -16,17 +16,15 @@ from procedures.estimation.translation import RANK, estimate_translation
 
 FEWEST_CONSTRAINTS = 3
 
-# Smallest over largest singular value. Refused below DEGENERATE: flanges turned about one axis, or not at all, have
-# 3e-16 without noise; with 0.1 mrad and 0.1 mm of it at most 1.4e-4 in the rotation step and 1.4e-3 in J_T (200 sets
-# each). Flanges turned by 15 to 40 deg about random axes have 0.013 at least (3 to 7 constraints, 200 sets).
+# How far, rms, the axis about which the flanges turn least wanders between the constraints. WANDER_NUMBERS
+ONE_AXIS = 0.005  # rad
+
+# Smallest over largest singular value of a step. DEGENERATE_NUMBERS
 DEGENERATE = 0.003
 
 # Warned of below WEAK: fans with 5 deg about a second axis have up to 0.031; 7 random orientations 0.065 in 19 of
 # 20 sets, the reference captures 0.41.
 WEAK = 0.04
-
-# Only to put the reason into words; what is refused is decided by the singular values.
-_SAME_DIRECTION = 0.01  # rad
 
 
 @dataclass(frozen=True)
@@ -82,11 +80,10 @@ def estimate(
     members = _members(constraints)
     flanges = np.stack([nearest_rotation(T_A_H[m, :3, :3].mean(axis=0)) for m in members.values()])
     directions = _directions(members, T_P_T[:, :3, 3], T_P_A[:3, :3] @ flanges @ T_H_E[:3, 2])
-    _refuse_degenerate(rotation_singular_values(flanges, T_H_E[:3, 2]), flanges, directions)
+    _refuse_one_axis(flanges, directions)
 
     rotation = estimate_rotation(directions, flanges, T_P_A[:3, :3], T_H_E[:3, 2])
     rotation_values = rotation_singular_values(flanges, rotation.z_H_E)
-    _refuse_degenerate(rotation_values, flanges, directions)
 
     of_capture = np.empty((len(T_A_H), 3))
     for m, direction in zip(members.values(), directions, strict=True):
@@ -94,10 +91,7 @@ def estimate(
     translation = estimate_translation(
         of_capture, T_A_H, T_P_T[:, :3, 3], rotation.R_P_A, rotation.z_H_E, T_P_A[:3, 3], T_H_E[:3, 3]
     )
-    translation_values = translation.singular_values
-    _refuse_degenerate(translation_values[:RANK], flanges, directions)
-
-    conditioning = min(_conditioning(rotation_values), _conditioning(translation_values[:RANK]))
+    conditioning = _conditioning(rotation_values, translation.singular_values[:RANK])
     R_H_E = smallest_rotation(T_H_E[:3, 2], rotation.z_H_E) @ T_H_E[:3, :3]
     return Estimate(
         T_P_A=transform(rotation.R_P_A, translation.p_P_A),
@@ -106,7 +100,7 @@ def estimate(
         iterations=rotation.iterations,
         unobservable=_UNOBSERVABLE,
         rotation_singular_values=rotation_values,
-        translation_singular_values=translation_values,
+        translation_singular_values=translation.singular_values,
         conditioning=conditioning,
         warnings=_warnings(conditioning),
     )
@@ -133,21 +127,33 @@ def _directions(members: dict[Hashable, list[int]], points: Array, nominal: Arra
     return directions
 
 
-def _conditioning(singular_values: Array) -> float:
-    return float(singular_values[-1] / singular_values[0])
+def _refuse_one_axis(flanges: Array, directions: Array) -> None:
+    """Both steps are singular if a direction fixed in the flange is fixed in A as well, whatever the optical axis.
 
-
-def _refuse_degenerate(singular_values: Array, flanges: Array, directions: Array) -> None:
-    conditioning = _conditioning(singular_values)
-    if conditioning >= DEGENERATE:
+    A unit vector u that every rotation takes to the same place keeps its length under their mean; one that
+    wanders by a small rms angle loses half that angle's square.
+    """
+    wander = np.sqrt(2 * np.maximum(0.0, 1 - np.linalg.svd(flanges.mean(axis=0), compute_uv=False)))
+    if wander[0] >= ONE_AXIS:
         return
-    if np.max(rotation_angle(flanges, flanges[0])) < _SAME_DIRECTION:
+    if wander[-1] < ONE_AXIS:
         reason = "the active flange has the same orientation in all constraints"
-    elif np.max(np.linalg.norm(np.cross(directions, directions[0]), axis=1)) < _SAME_DIRECTION:
+    elif 1 - np.linalg.norm(directions.mean(axis=0)) < ONE_AXIS**2:
         reason = "the optical axes of all constraints are parallel"
     else:
         reason = "the active flange is turned about one axis only between the constraints"
-    raise Degenerate(f"{reason} (conditioning {conditioning:.1e}, at least {DEGENERATE:g} is needed)")
+    raise Degenerate(f"{reason} (that axis wanders by {1e3 * wander[0]:.2g} mrad, {1e3 * ONE_AXIS:g} are needed)")
+
+
+def _conditioning(*steps: Array) -> float:
+    """The lowest ratio of smallest to largest singular value; refused if too low."""
+    conditioning = min(float(values[-1] / values[0]) for values in steps)
+    if conditioning < DEGENERATE:
+        raise Degenerate(
+            "these turns of the active flange do not determine the transforms for this optical axis"
+            f" (conditioning {conditioning:.1e}, at least {DEGENERATE:g} is needed)"
+        )
+    return conditioning
 
 
 def _warnings(conditioning: float) -> tuple[str, ...]:

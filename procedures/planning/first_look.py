@@ -21,7 +21,8 @@ from procedures.planning.model import ArmModel, CellModel, Posture
 from procedures.planning.ways import Leg, WayFinder
 
 BOARD_TILT = np.deg2rad(25.0)
-"""The board is tilted by this much (rad) about axes a quarter turn apart: at least 20 degrees between any two looks."""
+"""The board's normal leans by this much (rad) from the camera's, each time in another quarter of its view: between any
+two looks it is tilted by at least 20 degrees."""
 
 STAND_OFF_CLEARANCE = 0.25
 """Clearance (m) from which on more is worth nothing: a decimetre of base error and its lever are inside."""
@@ -30,6 +31,12 @@ _FORWARD = (0.25, 0.30, 0.20, 0.35)  # m in front of its own base
 _HEIGHT = (0.50, 0.45, 0.55, 0.40, 0.60)  # m above its own base
 _ROLLS = np.deg2rad([0.0, 90.0, 180.0, -90.0])
 _STARTS = 6
+STEEPER_TILT = np.deg2rad(45.0)
+"""The same (rad) for the looks after the fifth."""
+
+CAMERA_LEAN = np.deg2rad(6.0)
+"""The camera looks past the board's centre by this much (rad), in another direction in each look."""
+
 _GOOD_DISTANCE = 0.65  # m between camera and board
 _SEARCH_RINGS = np.deg2rad([12.0, 20.0])
 _CAMERA_ROLLS = np.deg2rad([40.0, 25.0, 12.0, 60.0])
@@ -37,7 +44,7 @@ _CAMERA_ROLLS = np.deg2rad([40.0, 25.0, 12.0, 60.0])
 
 @dataclass(frozen=True, eq=False)
 class StandOff:
-    """Where both arms face each other from afar, the legs that lead there, and the clearance (m) there."""
+    """Where both arms face each other from afar, the legs that lead there, and how far apart the arms are there (m)."""
 
     posture: Posture
     way: tuple[Leg, ...]
@@ -63,7 +70,7 @@ def find_stand_off(model: CellModel, belief: Belief, ways: WayFinder, start: Pos
         posture = Posture.of(q_a[i], q_p[j])
         way = ways.find(start, posture)
         if way is not None:
-            clearance = float(ways.geometry.clearance([q_a[i]], [q_p[j]], belief.T_P_A)[0])
+            clearance = float(ways.geometry.between([q_a[i]], [q_p[j]], belief.T_P_A)[0])
             T_E_T = inverse(model.camera_in_passive(q_a[i], belief)) @ model.target_in_passive(q_p[j])
             return StandOff(posture, way, clearance, float(T_E_T[2, 3]))
     raise NoPlan(
@@ -78,29 +85,27 @@ def look_postures(model: CellModel, belief: Belief, ways: WayFinder, at: Posture
     Look 0 is the stand-off itself and, should the board not be seen there, the camera tilted about its own lens in
     rings. Later ones tilt the board about its own centre, point the camera at it as now believed, and roll it.
     """
+    aimed = model.camera_in_passive(at.active, belief)
+    T_P_T = model.target_in_passive(at.passive)
     if number == 0:
         yield at
-        turns: Iterator[tuple[Array, float]] = (
-            (_about(azimuth, angle), 0.0) for angle in _SEARCH_RINGS for azimuth in np.arange(8) * np.pi / 4
-        )
-        aimed = model.camera_in_passive(at.active, belief)
-        tilt = np.eye(3)
-    else:
-        quarter = np.pi / 4 + (number - 1) * np.pi / 2
-        ring = 1.0 if number <= 4 else 0.5
-        tilt = _about(quarter, BOARD_TILT * ring)
-        aimed = _aimed(model.camera_in_passive(at.active, belief), model.target_in_passive(at.passive)[:3, 3])
-        sign = 1.0 if number % 2 else -1.0
-        lean = _about(quarter + np.pi / 2, np.deg2rad(6.0))
-        turns = ((lean, sign * roll) for roll in (*_CAMERA_ROLLS, *-_CAMERA_ROLLS))
-    T_P_T = model.target_in_passive(at.passive)
-    T_P_T = transform(T_P_T[:3, :3] @ tilt, T_P_T[:3, 3])
-    for lean, roll in turns:
-        turned = aimed.copy()
-        turned[:3, :3] = aimed[:3, :3] @ lean @ rotation_from_vector([0.0, 0.0, roll])
-        posture = _posture(model, belief, turned, T_P_T, at)
-        if posture is not None and _shows(model, belief, ways, posture, whole=number > 0):
-            yield posture
+        for angle, azimuth in itertools.product(_SEARCH_RINGS, np.arange(8) * np.pi / 4):
+            posture = _posture(model, belief, _turned(aimed, _about(azimuth, angle)), T_P_T, at)
+            if posture is not None and _is_clear(model, belief, ways, posture):
+                yield posture
+        return
+    aimed = _aimed(aimed, T_P_T[:3, 3])
+    azimuth = np.pi / 4 + (number - 1) * np.pi / 2
+    angle = BOARD_TILT if number <= 4 else STEEPER_TILT
+    lean = _about(azimuth + np.pi / 2, CAMERA_LEAN)
+    sign = 1.0 if number % 2 else -1.0
+    for roll in (*_CAMERA_ROLLS, *-_CAMERA_ROLLS):
+        T_P_E = _turned(aimed, lean @ rotation_from_vector([0.0, 0.0, sign * roll]))
+        posture = _posture(model, belief, T_P_E, _tilted(T_P_T, T_P_E, azimuth, angle), at)
+        if posture is not None and _is_clear(model, belief, ways, posture):
+            T_E_T = inverse(model.camera_in_passive(posture.active, belief)) @ model.target_in_passive(posture.passive)
+            if model.in_view(T_E_T[None])[0]:
+                yield posture
 
 
 def _posture(model: CellModel, belief: Belief, T_P_E: Array, T_P_T: Array, near: Posture) -> Posture | None:
@@ -111,12 +116,21 @@ def _posture(model: CellModel, belief: Belief, T_P_E: Array, T_P_T: Array, near:
     return Posture.of(q_a[0], q_p[0]) if reached_a[0] and reached_p[0] else None
 
 
-def _shows(model: CellModel, belief: Belief, ways: WayFinder, posture: Posture, *, whole: bool) -> bool:
-    clearance = ways.geometry.clearance([posture.active], [posture.passive], belief.T_P_A)[0]
-    if clearance < model.margin:
-        return False
-    T_E_T = inverse(model.camera_in_passive(posture.active, belief)) @ model.target_in_passive(posture.passive)
-    return not whole or bool(model.in_view(T_E_T[None])[0])
+def _is_clear(model: CellModel, belief: Belief, ways: WayFinder, posture: Posture) -> bool:
+    clearance = ways.geometry.clearance([posture.active], [posture.passive], belief.T_P_A)
+    return bool(clearance[0] >= model.margin)
+
+
+def _turned(T: Array, rotation: Array) -> Array:
+    """A frame turned about its own origin."""
+    return transform(T[:3, :3] @ rotation, T[:3, 3])
+
+
+def _tilted(T_P_T: Array, T_P_E: Array, azimuth: float, angle: float) -> Array:
+    """The board turned about its centre until its normal leans by ``angle`` from the camera, at ``azimuth`` in view."""
+    leaning = np.array([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)])
+    normal = -T_P_E[:3, :3] @ leaning
+    return transform(smallest_rotation(T_P_T[:3, 2], normal) @ T_P_T[:3, :3], T_P_T[:3, 3])
 
 
 def _level(direction: Array, what: str) -> Array:

@@ -51,13 +51,16 @@ def refine(model: CellModel, views: Sequence[View]) -> tuple[Belief, float]:
 def arrival_scatter(model: CellModel) -> float:
     """How far the feature lands from where it was sent, px per axis, 1 sigma, by the passive arm's joint noise.
 
-    The lateral motion of the target by each joint's error, over random postures, seen from the middle distance.
+    The motion of the target across the view by each joint's error, seen from the middle distance, over random
+    postures that reach out (the farther half of them), as they do towards the other arm.
     """
     arm = model.passive
     rng = np.random.default_rng(0)
     q = rng.uniform(arm.lower, arm.upper, (400, arm.chain.joints))
     flange = arm.chain.forward(q)
-    J = arm.chain.jacobian(q)
+    reach = np.linalg.norm(flange[:, :3, 3], axis=1)
+    outer = reach >= np.median(reach)
+    J, flange = arm.chain.jacobian(q[outer]), flange[outer]
     lever = flange[:, :3, :3] @ model.T_F_T[:3, 3]
     at_target = J[:, :3] + np.cross(J[:, 3:], lever[:, :, None], axis=1)
     per_axis = np.sqrt(np.mean(np.sum(at_target**2, axis=2)))

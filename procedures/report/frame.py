@@ -41,7 +41,7 @@ def draw_frame(
     panel.plot([], [], ".", color=BLUE, markersize=8, label="corners")
     panel.plot([], [], "x", color=GREY, label=f"offsets of all {len(captures)} captures")
     du, dv = shown.feature - centre
-    head(panel, f"Camera frame: feature point off the optical axis by ({du:+.3f}, {dv:+.3f}) px")
+    head(panel, f"Camera frame: offset ({du:+.3f}, {dv:+.3f}) px")
 
 
 def _draw_board(axes: Axes, image: Image, shown: CaptureRecord, centre: Array) -> None:
@@ -77,9 +77,9 @@ def _draw_circles(axes: Axes, offset: Array, half: float) -> None:
     """Red about the optical axis, green about the feature point, in a view of ``half`` to each side of the axis."""
     from matplotlib.patches import Circle
 
-    for (name, colour, radius), middle in zip(_CIRCLES, (np.zeros(2), offset), strict=True):
+    for (_, colour, radius), middle in zip(_CIRCLES, (np.zeros(2), offset), strict=True):
         u, v = middle
-        circle = Circle((u, v), radius * half, fill=False, edgecolor=colour, linewidth=2.5, gid=name)
+        circle = Circle((u, v), radius * half, fill=False, edgecolor=colour, linewidth=2.5)
         axes.add_patch(circle)
         axes.plot(u, v, "+", color=colour, markersize=9, markeredgewidth=1.8)
     axes.set(xlim=(-half, half), ylim=(half, -half), aspect="equal")

@@ -20,7 +20,7 @@ from procedures.report.style import BLUE, DARK, GREEN, ORANGE, RED, TEXT, head, 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
-    from mpl_toolkits.mplot3d.axes3d import Axes3D
+    from mpl_toolkits.mplot3d.axes3d import Axes3D  # type: ignore[import-untyped]
 
 Positions = Mapping[tuple[str, int], Array]
 """Feature points (3,) in P, m, by constraint and number of the position."""
@@ -47,18 +47,18 @@ def draw_scene(
     )
     axes.patch.set_visible(False)
 
-    reached = {(c.constraint, c.position): feature_point(cell, c.passive_joints) for c in captures}
+    reached = {(c.constraint, c.position): _feature_point(cell, c.passive_joints) for c in captures}
     planned = {} if plan is None else _planned(cell, plan)
     _draw_arms(axes, cell, result, shown)
     _draw_axes(axes, cell, captures, result, reached)
     if planned:
-        _draw_points(axes, planned, f"planned ({len(planned)})", "none", BLUE, 80)
-    _draw_points(axes, reached, f"reached ({len(reached)}){_distance(planned, reached)}", RED, RED, 14)
+        _draw_points(axes, planned, f"planned: {len(planned)}", "none", BLUE, 80)
+    _draw_points(axes, reached, f"reached: {len(reached)}", RED, RED, 14)
     _finish(axes)
-    head(panel, "Cell in the passive base P, placed by the transforms found", axes)
+    head(panel, _title(planned, reached), axes)
 
 
-def feature_point(cell: CellConfig, joints: Joints) -> Array:
+def _feature_point(cell: CellConfig, joints: Joints) -> Array:
     """(3,) m in P at the passive arm's joint angles (rad)."""
     passive = cell.passive
     return np.asarray((passive.chain.forward(joints) @ passive.target_mount_transform)[:3, 3])
@@ -66,18 +66,19 @@ def feature_point(cell: CellConfig, joints: Joints) -> Array:
 
 def _planned(cell: CellConfig, plan: Plan) -> Positions:
     return {
-        (constraint.name, number): feature_point(cell, position.passive)
+        (constraint.name, number): _feature_point(cell, position.passive)
         for constraint in plan.constraints
         for number, position in enumerate(constraint.positions)
     }
 
 
-def _distance(planned: Positions, reached: Positions) -> str:
+def _title(planned: Positions, reached: Positions) -> str:
+    title = "Cell in the passive base P"
     both = planned.keys() & reached.keys()
     if not both:
-        return ""
-    mean = np.mean([np.linalg.norm(planned[key] - reached[key]) for key in both])
-    return f", on average {1e3 * mean:.1f} mm from there"
+        return title
+    off = np.mean([np.linalg.norm(planned[key] - reached[key]) for key in both])
+    return f"{title}: reached {1e3 * off:.1f} mm from planned"
 
 
 def _draw_points(axes: Axes3D, points: Positions, words: str, face: str, edge: str, size: float) -> None:
@@ -95,7 +96,7 @@ def _draw_axes(
         camera, axis = T_P_E[:3, 3], T_P_E[:3, 2]
         farthest = max((point - camera) @ axis for (name, _), point in reached.items() if name == constraint)
         x, y, z = _mm([camera, camera + _BEYOND * farthest * axis]).T
-        words = "optical axes, from the camera" if number == 0 else None
+        words = "optical axes" if number == 0 else None
         axes.plot(x, y, z, color=GREEN, linewidth=1.4, marker="s", markersize=4, markevery=[0], label=words)
 
 
@@ -105,16 +106,17 @@ def _draw_arms(axes: Axes3D, cell: CellConfig, result: Result, shown: CaptureRec
     T_P_T = cell.passive.chain.forward(shown.passive_joints) @ cell.passive.target_mount_transform
     active = apply(result.T_P_A, _course(cell.active.chain, shown.active_joints))
     passive = _course(cell.passive.chain, shown.passive_joints)
-    outline = cell.target.board.outline
+    camera = np.vstack([active[-1], apply(T_P_E, _field_of_view(cell))])
+    target = apply(T_P_T, cell.target.board.outline[[0, 1, 2, 3, 0]])
     for base, words, course, tool, colour in (
-        ("A", f"active arm ({cell.active_name})", active, apply(T_P_E, _field_of_view(cell)), ORANGE),
-        ("P", f"passive arm ({cell.passive_name})", passive, apply(T_P_T, outline[[0, 1, 2, 3, 0]]), DARK),
+        ("A", f"active arm ({cell.active_name})", active, camera, ORANGE),
+        ("P", f"passive arm ({cell.passive_name})", passive, target, DARK),
     ):
         x, y, z = _mm(course).T
         axes.plot(x, y, z, color=colour, linewidth=4, marker="o", markersize=5, label=words)
         axes.text(x[0], y[0], z[0] - 90, base, fontsize=TEXT + 1, weight="bold", color=colour, ha="center")
         x, y, z = _mm(tool).T
-        axes.plot(x, y, z, color=colour, linewidth=1.5)
+        axes.plot(x, y, z, color=colour, linewidth=2)
 
 
 def _course(chain: Chain, q: Joints) -> Array:

@@ -21,7 +21,7 @@ from procedures.alignment import largest_alignment_error, tolerance_px
 from procedures.analysis import analyse
 from procedures.calibrate import Calibration, captures_of
 from procedures.engine import Engine
-from procedures.observers import Observers
+from procedures.observers import Observer, Observers
 from procedures.planning.model import CellModel
 from procedures.planning.plan import PLAN_FORMAT, Plan
 from procedures.rehearsal import rehearse
@@ -62,11 +62,12 @@ def run_cell(options: RunOptions) -> int:
     folder = options.out or Path("sessions") / f"{started:%Y%m%d-%H%M%S}-{file.cell.name}"
     session = Session.create(folder, file.text)
     try:
-        _execute(file, model, calibration, session, console)
+        with progress(console) as watcher:
+            execute(file, model, calibration, session, watcher)
     finally:
         captures = captures_of(session.journal, file.sha256, started.isoformat(timespec="seconds"))
         write_captures(session.captures_path, captures)
-    result = _conclude(file, session, captures)
+    result = conclude(file, session, captures)
     show_result(console, file.cell, result, simulated_truth(file), as_json=options.json)
     console.print(f"session: {session.folder}", soft_wrap=True, highlight=False)
     return 0 if result.verdict == "ok" else FAULT
@@ -83,14 +84,11 @@ def _load(options: RunOptions) -> CellFile:
     return load_cell(options.cell, overrides)
 
 
-def _execute(file: CellFile, model: CellModel, calibration: Calibration, session: Session, console: Console) -> None:
+def execute(file: CellFile, model: CellModel, calibration: Calibration, session: Session, watcher: Observer) -> None:
+    """Run the procedure on the cell's devices, which are closed again on any exit."""
     placement = Placement(model.geometry(model.nominal), model.nominal.T_P_A)
     try:
-        with (
-            progress(console) as watcher,
-            Observers(watcher) as observers,
-            Cell(file, placement) as cell,
-        ):
+        with Observers(watcher) as observers, Cell(file, placement) as cell:
             engine = Engine(cell, model, session, observers)
             with aborting_with(engine.abort):
                 engine.run(calibration.steps())
@@ -99,7 +97,7 @@ def _execute(file: CellFile, model: CellModel, calibration: Calibration, session
         raise
 
 
-def _conclude(file: CellFile, session: Session, captures: Captures) -> Result:
+def conclude(file: CellFile, session: Session, captures: Captures) -> Result:
     """Analyse, and only then compare with the truth where there is one; write both and the picture."""
     result = analyse(captures, file.cell, file.cell.procedure.method)
     truth = simulated_truth(file)

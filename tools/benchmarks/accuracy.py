@@ -1,0 +1,97 @@
+"""Accuracy and alignment over seeds: whole runs on the simulator.
+
+python -m tools.benchmarks.accuracy cells/paper.yaml --seeds 20 [--set PATH=VALUE]...
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dualcal_hal.cellfile import load_cell
+from dualcal_hal.session.folder import Session
+from procedures.calibrate import Calibration, captures_of
+from procedures.events import PointDone
+from procedures.planning.model import CellModel
+from tools.cli.run import conclude, execute
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run's figures: mismatch and translation in mm, rotation in deg, frames for each point, points given up."""
+
+    seed: int
+    mismatch: float
+    translation: float
+    rotation: float
+    frames: tuple[int, ...]
+    given_up: int
+    verdict: str
+
+
+def run(path: Path, seed: int, overrides: list[str]) -> Run:
+    """A whole run with both seeds set, in a folder that is thrown away."""
+    file = load_cell(path, [*overrides, f"procedure.seed={seed}", f"simulation.seed={seed}"])
+    model = CellModel(file.cell)
+    points: list[PointDone] = []
+
+    def collect(event: object) -> None:
+        if isinstance(event, PointDone):
+            points.append(event)
+
+    with tempfile.TemporaryDirectory() as folder:
+        session = Session.create(Path(folder) / "session", file.text)
+        execute(file, model, Calibration(file.cell, model), session, collect)
+        result = conclude(file, session, captures_of(session.journal, file.sha256, None))
+    assert result.truth_error is not None
+    assert result.mismatch_after is not None
+    return Run(
+        seed,
+        result.mismatch_after.mean * 1e3,
+        result.truth_error.base_translation * 1e3,
+        float(np.rad2deg(result.truth_error.base_rotation)),
+        tuple(point.frames for point in points),
+        sum(not point.captured for point in points),
+        result.verdict,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cell", type=Path)
+    parser.add_argument("--seeds", type=int, default=20, help="runs with seeds 1 to this number")
+    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE")
+    parser.add_argument("--processes", type=int, default=2)
+    options = parser.parse_args()
+    seeds = range(1, options.seeds + 1)
+    print("seed  mismatch mean mm  T_P_A deg  T_P_A mm  frames mean  p95  given up  verdict")
+    runs = []
+    with ProcessPoolExecutor(options.processes) as pool:
+        for one in pool.map(run, [options.cell] * len(seeds), seeds, [options.set] * len(seeds)):
+            runs.append(one)
+            print(
+                f"{one.seed:4d}  {one.mismatch:16.4f}  {one.rotation:9.4f}  {one.translation:8.3f}"
+                f"  {np.mean(one.frames):11.2f}  {np.percentile(one.frames, 95):3.0f}  {one.given_up:8d}  {one.verdict}",
+                flush=True,
+            )
+    frames = np.concatenate([one.frames for one in runs])
+    mismatch, rotation, translation = np.array([(one.mismatch, one.rotation, one.translation) for one in runs]).T
+    print(
+        f"mismatch: mean {mismatch.mean():.4f}, max {mismatch.max():.4f} mm; T_P_A: rms {_rms(rotation):.4f}, max "
+        f"{rotation.max():.4f} deg, rms {_rms(translation):.3f}, max {translation.max():.3f} mm; frames a point: mean "
+        f"{frames.mean():.2f}, p95 {np.percentile(frames, 95):.0f}, max {frames.max()}; "
+        f"given up {sum(one.given_up for one in runs)} of {len(frames)} points"
+    )
+
+
+def _rms(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+if __name__ == "__main__":
+    main()

@@ -31,7 +31,7 @@ def on_line(T, lateral, slope, z):
     return T[:3, 3] + T[:3, :3] @ [*(np.asarray(lateral) + np.asarray(slope) * z), z]
 
 
-# -- the axis --------------------------------------------------------------------------------------------------------
+# -- the axis --------------------------------------------------------------------------------------
 
 
 def test_without_aligned_points_the_axis_is_the_believed_one():
@@ -73,7 +73,7 @@ def test_a_features_offset_in_the_image_is_taken_off_to_find_the_axis():
     )
 
 
-# -- the servo -------------------------------------------------------------------------------------------------------
+# -- the servo -------------------------------------------------------------------------------------
 
 
 @given(vectors)
@@ -110,7 +110,7 @@ def test_a_jacobian_that_has_become_singular_is_given_up_for_the_first_one():
     np.testing.assert_allclose(servo.step(np.array([0.01, 0.02])), [-0.01, -0.02])
 
 
-# -- the tolerance -----------------------------------------------------------------------------------------------------
+# -- the tolerance ---------------------------------------------------------------------------------
 
 
 def test_the_scatter_of_arrivals_is_that_of_the_joints_noise_seen_by_the_camera():

@@ -79,7 +79,7 @@ def seen_from_camera(model, q_a, q_p, belief):
     return inverse(model.camera_in_passive(q_a, belief)) @ model.target_in_passive(q_p)
 
 
-# -- stand-off and looks -------------------------------------------------------------------------------------------
+# -- stand-off and looks ---------------------------------------------------------------------------
 
 
 def test_at_the_stand_off_the_board_faces_the_camera_in_view_and_far_from_it(model, stand_off):
@@ -126,7 +126,7 @@ def test_bases_that_stand_above_each_other_have_no_stand_off(model, ways):
         find_stand_off(model, belief, ways, model.home, 1)
 
 
-# -- poses ---------------------------------------------------------------------------------------------------------
+# -- poses -----------------------------------------------------------------------------------------
 
 
 def test_a_plan_has_the_constraints_and_positions_asked_for(plan):
@@ -233,7 +233,7 @@ def test_orientations_turned_about_one_axis_only_are_not_turned_about_two(angle)
     assert turned_about_two_axes(both) > 0.3 * angle
 
 
-# -- ways ----------------------------------------------------------------------------------------------------------
+# -- ways ------------------------------------------------------------------------------------------
 
 
 def test_no_way_leads_through_the_other_arm(model):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Rectangle
 from matplotlib.transforms import Bbox
 
 from dualcal_hal.camera import Image
@@ -56,6 +58,13 @@ def heads(figure: Figure) -> list[str]:
     return [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
 
 
+def legend(figure: Figure, head: str) -> list[str]:
+    (axes,) = [axes for axes in figure.axes if axes.get_title(loc="left").startswith(head)]
+    found = axes.get_legend()
+    assert found is not None
+    return [text.get_text() for text in found.get_texts()]
+
+
 def points_3d(figure: Figure, label: str) -> np.ndarray[Any, np.dtype[np.float64]]:
     axes: Any = panel(figure, "x, mm")
     (points,) = [collection for collection in axes.collections if collection.get_label() == label]
@@ -81,6 +90,11 @@ def test_the_picture_is_a_png_of_the_stated_size_and_leaves_nothing_else_behind(
     assert picture.shape[1::-1] == SIZE_PX
     assert picture.std() > 20
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_command_line_does_not_load_the_plotting_library_before_it_draws() -> None:
+    loaded = "import sys, procedures.report; sys.exit(any(name.startswith('matplotlib') for name in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", loaded], check=False).returncode == 0
 
 
 # -- the camera's frame ------------------------------------------------------------------------------------------------
@@ -111,7 +125,16 @@ def test_the_offsets_of_all_captures_stand_beside_the_tolerance(drawn: Figure) -
     axes = panel(drawn, OFFSETS)
     (offsets,) = [line.get_xydata() for line in axes.lines if len(line.get_xydata()) > 1]
     np.testing.assert_allclose(offsets + PRINCIPAL_POINT, [capture.feature for capture in captures().captures])
-    assert [text.get_text() for text in axes.texts] == ["tolerance 0.1 px"]
+    (tolerance,) = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
+    np.testing.assert_allclose(tolerance.get_bbox().extents, [-0.1, -0.1, 0.1, 0.1])
+    assert "tolerance 0.1 px" in legend(drawn, "Camera frame")
+
+
+def test_a_tolerance_that_follows_the_scatter_has_no_square() -> None:
+    procedure = cell().procedure.model_copy(update={"tolerance_px": "auto"})
+    automatic = figure(cell=cell().model_copy(update={"procedure": procedure}))
+    assert not [patch for patch in panel(automatic, OFFSETS).patches if isinstance(patch, Rectangle)]
+    assert not [words for words in legend(automatic, "Camera frame") if "tolerance" in words]
 
 
 # -- convergence and mismatch ------------------------------------------------------------------------------------------
@@ -206,6 +229,7 @@ def test_the_arms_stand_as_at_the_capture_that_is_shown(drawn: Figure) -> None:
     np.testing.assert_allclose(arms["active arm (left)"][0], 1e3 * result().T_P_A[:3, 3], atol=1e-9)
     frames = PASSIVE.frames(SHOWN.passive_joints)
     course = arms["passive arm (right)"]
+    np.testing.assert_allclose(course[1], [0.0, 0.0, 136.5], atol=1e-9)  # along the first joint's axis by its d
     for frame in frames:
         assert np.linalg.norm(course - 1e3 * frame[:3, 3], axis=1).min() < 1e-9
 

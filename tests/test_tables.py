@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console, RenderableType
 from scipy.spatial.transform import Rotation
 
-from dualcal_hal.session.result import Rejected
+from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Rejected
 from procedures.analysis import analyse
 from procedures.planning.ways import Leg
 from procedures.report import error_table, mismatch_table, outcome, plan_table, result_tables, way_table
@@ -102,6 +102,13 @@ def test_the_results_errors_against_the_truth_come_below() -> None:
     assert row(text, "T_P_A translation") == ["mm", f"{1e3 * error.base_translation:.3f}"]
     assert row(text, "optical axis direction") == ["deg", f"{np.degrees(error.camera_axis):.4f}"]
     assert row(text, "camera across the axis") == ["mm", f"{1e3 * error.camera_sideways:.3f}"]
+
+
+def test_a_zero_has_no_sign() -> None:
+    none = {T_P_A_NAME: result().T_P_A + 1e-9, T_H_E_NAME: result().T_H_E + 1e-9}
+    text = printed(error_table(MINE, result(), none))
+    assert row(text, "dp_P_A_x")[-1] == "0.00"
+    assert row(text, "w_x")[-1] == "0.0000"
 
 
 def test_without_a_truth_nothing_is_said_of_it() -> None:

@@ -149,7 +149,8 @@ class _Stripes:
         v, u = (grid.reshape(-1, 1) for grid in np.meshgrid(offset, offset))
         along_u, along_v = self.along_u[pixels], self.along_v[pixels]
         position = np.asarray(self.position[pixels] + u * along_u + v * along_v, dtype=np.float32)
-        part_u, part_v = (np.broadcast_to(along / _PARTS, position.shape) for along in (along_u, along_v))
+        part_u: Values = np.broadcast_to(along_u / _PARTS, position.shape)
+        part_v: Values = np.broadcast_to(along_v / _PARTS, position.shape)
         return _Stripes(position, part_u, part_v, self.squares)
 
     def within(self, margin: float) -> Values:
@@ -188,35 +189,40 @@ class _Stripes:
         return longer, np.maximum(np.minimum(u, v), 1e-9 * longer)
 
 
-def project_rays(rays: Array, intrinsics: Intrinsics) -> Array:
-    """Undistorted (n, 2) normalised image coordinates to (n, 2) px of the raw image."""
-    points = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
-    zero = np.zeros(3)
-    pixels, _ = cv2.projectPoints(points, zero, zero, intrinsics.matrix, intrinsics.distortion)
-    return np.asarray(pixels, dtype=float).reshape(-1, 2)
-
-
 def undistorted_rays(intrinsics: Intrinsics) -> Array:
     """(height, width, 2): the undistorted normalised coordinates of each pixel's centre, exact to 1e-9 px.
 
     OpenCV stops at its count of iterations without a word, so the result is checked, and iterated on.
+    Raises UsageError if the distortion cannot be undone in some pixel.
     """
     width, height = intrinsics.size
-    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(float)
     focal = np.diag(intrinsics.matrix)[:2]
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(float)
+    seen = (pixels - intrinsics.principal_point) / focal
     if not intrinsics.distortion.any():
-        rays = (pixels - intrinsics.principal_point) / focal
-        return rays.reshape(height, width, 2)
+        return seen.reshape(height, width, 2)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
     ideal = cv2.undistortImagePoints(pixels, intrinsics.matrix, intrinsics.distortion, None, criteria)
     rays = (np.asarray(ideal, dtype=float).reshape(-1, 2) - intrinsics.principal_point) / focal
     worst = np.inf
     while True:
-        missing = pixels - project_rays(rays, intrinsics)
-        previous, worst = worst, float(np.abs(missing).max())
+        missing = seen - _distorted(rays, intrinsics.distortion)
+        previous, worst = worst, float(np.abs(missing * focal).max())
         if worst < 1e-9:
             return rays.reshape(height, width, 2)
         if not worst < 0.9 * previous:
             break
-        rays = rays + missing / focal
+        rays += missing
     raise UsageError("camera.distortion: cannot be undone everywhere in the image; check its coefficients")
+
+
+def _distorted(rays: Array, distortion: Array) -> Array:
+    """Normalised image coordinates (n, 2) as the lens bends them, by OpenCV's k1, k2, p1, p2, k3."""
+    k1, k2, p1, p2, k3 = distortion
+    x, y = rays[:, 0], rays[:, 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    xy = 2.0 * x * y
+    return np.stack(
+        [x * radial + p1 * xy + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + p2 * xy], axis=-1
+    )

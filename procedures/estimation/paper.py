@@ -11,16 +11,19 @@ from numpy.typing import ArrayLike
 from dualcal_hal.transforms import Array, nearest_rotation, smallest_rotation, transform
 from procedures.estimation.degenerate import Degenerate
 from procedures.estimation.line import fit_line
-from procedures.estimation.rotation import Iteration, estimate_rotation, rotation_singular_values
-from procedures.estimation.translation import RANK, estimate_translation
+from procedures.estimation.rotation import Iteration, RotationStep, estimate_rotation
+from procedures.estimation.translation import RANK, TranslationStep, estimate_translation
 
 FEWEST_CONSTRAINTS = 3
 
 # How far, rms, the axis about which the flanges turn least wanders between the constraints. WANDER_NUMBERS
 ONE_AXIS = 0.005  # rad
 
-# Smallest over largest singular value of a step. DEGENERATE_NUMBERS
-DEGENERATE = 0.003
+# Smallest over largest singular value of a step, below which even exact captures say nothing.
+DEGENERATE = 0.001
+
+# Sigma of the weakest direction of the rotation step. UNCERTAIN_NUMBERS
+UNCERTAIN = 0.05  # rad
 
 # Warned of below WEAK: fans with 5 deg about a second axis have up to 0.031; 7 random orientations 0.065 in 19 of
 # 20 sets, the reference captures 0.41.
@@ -83,7 +86,6 @@ def estimate(
     _refuse_one_axis(flanges, directions)
 
     rotation = estimate_rotation(directions, flanges, T_P_A[:3, :3], T_H_E[:3, 2])
-    rotation_values = rotation_singular_values(flanges, rotation.z_H_E)
 
     of_capture = np.empty((len(T_A_H), 3))
     for m, direction in zip(members.values(), directions, strict=True):
@@ -91,7 +93,7 @@ def estimate(
     translation = estimate_translation(
         of_capture, T_A_H, T_P_T[:, :3, 3], rotation.R_P_A, rotation.z_H_E, T_P_A[:3, 3], T_H_E[:3, 3]
     )
-    conditioning = _conditioning(rotation_values, translation.singular_values[:RANK])
+    conditioning = _conditioning(rotation, translation)
     R_H_E = smallest_rotation(T_H_E[:3, 2], rotation.z_H_E) @ T_H_E[:3, :3]
     return Estimate(
         T_P_A=transform(rotation.R_P_A, translation.p_P_A),
@@ -99,7 +101,7 @@ def estimate(
         optical_axis=rotation.z_H_E,
         iterations=rotation.iterations,
         unobservable=_UNOBSERVABLE,
-        rotation_singular_values=rotation_values,
+        rotation_singular_values=rotation.singular_values,
         translation_singular_values=translation.singular_values,
         conditioning=conditioning,
         warnings=_warnings(conditioning),
@@ -145,15 +147,19 @@ def _refuse_one_axis(flanges: Array, directions: Array) -> None:
     raise Degenerate(f"{reason} (that axis wanders by {1e3 * wander[0]:.2g} mrad, {1e3 * ONE_AXIS:g} are needed)")
 
 
-def _conditioning(*steps: Array) -> float:
-    """The lowest ratio of smallest to largest singular value; refused if too low."""
+def _conditioning(rotation: RotationStep, translation: TranslationStep) -> float:
+    """The lower ratio of smallest to largest singular value of both steps; refused where nothing can be said."""
+    steps = (rotation.singular_values, translation.singular_values[:RANK])
     conditioning = min(float(values[-1] / values[0]) for values in steps)
     if conditioning < DEGENERATE:
-        raise Degenerate(
-            "these turns of the active flange do not determine the transforms for this optical axis"
-            f" (conditioning {conditioning:.1e}, at least {DEGENERATE:g} is needed)"
-        )
+        raise Degenerate(f"{_TOO_WEAK} (conditioning {conditioning:.1e}, at least {DEGENERATE:g} is needed)")
+    if rotation.uncertainty > UNCERTAIN:
+        sigma, most = np.degrees(rotation.uncertainty), np.degrees(UNCERTAIN)
+        raise Degenerate(f"{_TOO_WEAK} (uncertain by {sigma:.1f} deg, at most {most:.1f} deg are accepted)")
     return conditioning
+
+
+_TOO_WEAK = "the active flange is turned too little about a second axis"
 
 
 def _warnings(conditioning: float) -> tuple[str, ...]:

@@ -34,11 +34,18 @@ class Iteration:
 
 @dataclass(frozen=True)
 class RotationStep:
-    """R_P_A (3, 3), z_H_E (3,), and how they were reached."""
+    """R_P_A (3, 3), z_H_E (3,), and how they were reached.
+
+    singular_values (5,): of eq. 3 linearised jointly in the rotation (3) and the optical axis (2), per constraint
+    (the Jacobian is divided by sqrt(n)); uncertainty: sigma of the weakest of the five directions (rad), from
+    what the fit leaves.
+    """
 
     R_P_A: Array
     z_H_E: Array
     iterations: tuple[Iteration, ...]
+    singular_values: Array
+    uncertainty: float
 
 
 def estimate_rotation(directions: Array, R_A_H: Array, R_P_A: Array, z_H_E: Array) -> RotationStep:
@@ -67,7 +74,7 @@ def estimate_rotation(directions: Array, R_A_H: Array, R_P_A: Array, z_H_E: Arra
         )
         R_A_P, z_H_E = updated, z
         if history[-1].rotation_update < CONVERGED:
-            return RotationStep(R_A_P.T, z_H_E, tuple(history))
+            return _report(directions, R_A_H, R_A_P, z_H_E, tuple(history))
     raise Degenerate(
         f"the rotation does not converge: it still changes by {history[-1].rotation_update:.1e}"
         f" after {len(history)} iterations"
@@ -101,15 +108,16 @@ def _tangent(z: Array) -> Array:
     return np.asarray(np.linalg.svd(z[None])[2][1:].T)
 
 
-def rotation_singular_values(R_A_H: Array, z_H_E: Array) -> Array:
-    """The five singular values of eq. 3 linearised jointly in the rotation (3) and the optical axis (2).
-
-    R_A_H (n, 3, 3), z_H_E (3,). Per constraint and radian (the Jacobian is divided by sqrt(n)), so they do not
-    grow with the number of constraints. They depend on the turns of the flange only, not on the measured
-    directions: noise in short lines cannot hide a degenerate set.
-    """
-    J = _joint_jacobian(R_A_H, z_H_E) / np.sqrt(len(R_A_H))
-    return np.asarray(np.linalg.svd(J, compute_uv=False))
+def _report(
+    directions: Array, R_A_H: Array, R_A_P: Array, z_H_E: Array, iterations: tuple[Iteration, ...]
+) -> RotationStep:
+    n = len(directions)
+    singular_values = np.linalg.svd(_joint_jacobian(R_A_H, z_H_E) / np.sqrt(n), compute_uv=False)
+    # A direction has two components, so 2n - 5 are left over.
+    sigma = np.linalg.norm(directions @ R_A_P.T - R_A_H @ z_H_E) / np.sqrt(2 * n - 5)
+    with np.errstate(divide="ignore"):
+        uncertainty = float(sigma / (np.sqrt(n) * singular_values[-1]))
+    return RotationStep(R_A_P.T, z_H_E, iterations, np.asarray(singular_values), uncertainty)
 
 
 def _rotation_from_sine(w: Array) -> Array:

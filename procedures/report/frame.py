@@ -11,7 +11,7 @@ from dualcal_hal.camera import Image
 from dualcal_hal.config import CellConfig
 from dualcal_hal.session.captures import CaptureRecord
 from dualcal_hal.transforms import Array
-from procedures.report.style import BLUE, GREEN, GREY, RED, TEXT, head, host, label
+from procedures.report.style import BLUE, GREEN, GREY, RED, head, host, label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.gridspec import SubplotSpec
 
 _SMALLEST_VIEW = 60.0  # px to each side of the optical axis
+_AROUND_CORNERS = 2.3  # with the squares around the inner corners of a small board
 _CIRCLES = (("optical axis", RED, 0.2), ("feature point", GREEN, 0.12))  # radii differ: the two should coincide
 
 
@@ -40,13 +41,15 @@ def draw_frame(
         panel.plot([], [], "o", color=colour, fillstyle="none", markersize=11, markeredgewidth=2.5, label=name)
     panel.plot([], [], ".", color=BLUE, markersize=8, label="corners")
     panel.plot([], [], "x", color=GREY, label=f"offsets of all {len(captures)} captures")
+    if cell.procedure.tolerance_px != "auto":
+        panel.plot([], [], "--", color=BLUE, label=f"tolerance {cell.procedure.tolerance_px:g} px")
     du, dv = shown.feature - centre
     head(panel, f"Camera frame: offset ({du:+.3f}, {dv:+.3f}) px")
 
 
 def _draw_board(axes: Axes, image: Image, shown: CaptureRecord, centre: Array) -> None:
     corners = np.array(shown.corners or [shown.feature]) - centre
-    half = max(_SMALLEST_VIEW, 1.6 * float(np.abs(corners).max()))
+    half = max(_SMALLEST_VIEW, _AROUND_CORNERS * float(np.abs(corners).max()))
     height, width = image.shape
     left, top = -0.5 - centre
     axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(left, left + width, top + height, top))
@@ -67,7 +70,6 @@ def _draw_offsets(
         half = max(half, 1.5 * tolerance)
         side = 2 * tolerance
         axes.add_patch(Rectangle((-tolerance, -tolerance), side, side, fill=False, edgecolor=BLUE, linestyle="--"))
-        axes.text(0, -1.05 * tolerance, f"tolerance {tolerance:g} px", color=BLUE, fontsize=TEXT - 1, ha="center")
     axes.plot(*offsets.T, "x", color=GREY, markersize=6)
     _draw_circles(axes, shown.feature - centre, max(half, 1e-3))
     label(axes, "u, px", "v, px")

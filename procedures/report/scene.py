@@ -142,6 +142,9 @@ def _mm(points: ArrayLike) -> Array:
 
 
 def _finish(axes: Axes3D) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.set_aspect("equal")
     axes.set_box_aspect([np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())], zoom=1.15)
     axes.view_init(elev=22, azim=-72)

@@ -126,7 +126,7 @@ def _draw_mismatch(axes: Axes, cell: CellConfig, captures: Sequence[CaptureRecor
     axes.axhline(limit, color=RED, linewidth=2, label=f"limit on the mean: {limit:g} mm")
     if is_papers_cell(cell):
         before, after = PAPER_MISMATCH_MM["mean"]
-        axes.axhline(before, color=GREY, linestyle=":", label=f"paper's means: {before:g}, {after:g} mm")
+        axes.axhline(before, color=GREY, linestyle=":", label=f"paper's means: {before:g} and {after:g} mm")
         axes.axhline(after, color=GREY, linestyle=":")
     _separate_constraints(axes, [capture.constraint for capture in _verified(captures, result)])
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

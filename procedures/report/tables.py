@@ -29,10 +29,10 @@ _STYLES = {"ok": "bold green", "fail": "bold red"}
 
 def result_tables(cell: CellConfig, result: Result, truth: Mapping[str, Array] | None = None) -> Group:
     """All there is to say about a result; truth: both transforms (4, 4) in m by their names, where they are known."""
-    tables = [error_table(cell, result, truth)]
+    parts: list[RenderableType] = [error_table(cell, result, truth), ""]
     if result.mismatch_before is not None and result.mismatch_after is not None:
-        tables.append(mismatch_table(cell, result.mismatch_before, result.mismatch_after))
-    return Group(*tables, outcome(result))
+        parts.append(mismatch_table(cell, result.mismatch_before, result.mismatch_after))
+    return Group(*parts, outcome(result))
 
 
 def error_table(cell: CellConfig, result: Result, truth: Mapping[str, Array] | None = None) -> Table:
@@ -50,7 +50,7 @@ def error_table(cell: CellConfig, result: Result, truth: Mapping[str, Array] | N
     table = _table("Errors of the nominal transforms (Tables 3 and 4)", "error", "unit", *columns)
     for name, unit, values in _error_rows(columns):
         table.add_row(name, unit, *values)
-    along = [f"{1e3 * errors.dp_H_E @ result.optical_axis:.2f}" for errors in columns.values()]
+    along = [f"{1e3 * errors.dp_H_E @ result.optical_axis:z.2f}" for errors in columns.values()]
     table.add_row("dp_H_E along the axis" + ("*" if _shift_is_kept(result) else ""), "mm", *along)
     if result.truth_error is not None:
         table.add_section()
@@ -125,7 +125,7 @@ def _error_rows(columns: Mapping[str, NominalErrors]) -> Iterator[tuple[str, str
     ):
         for i, letter in enumerate("xyz"):
             values = [scale * getattr(errors, name)[i] for errors in columns.values()]
-            yield f"{name}_{letter}", unit, [f"{value:.{digits}f}" for value in values]
+            yield f"{name}_{letter}", unit, [f"{value:z.{digits}f}" for value in values]
 
 
 def _truth_rows(error: TruthError) -> Iterator[tuple[str, str, str]]:

@@ -76,7 +76,8 @@ def main() -> None:
             runs.append(one)
             print(
                 f"{one.seed:4d}  {one.mismatch:16.4f}  {one.rotation:9.4f}  {one.translation:8.3f}"
-                f"  {np.mean(one.frames):11.2f}  {np.percentile(one.frames, 95):3.0f}  {one.given_up:8d}  {one.verdict}",
+                f"  {np.mean(one.frames):11.2f}  {np.percentile(one.frames, 95):3.0f}"
+                f"  {one.given_up:8d}  {one.verdict}",
                 flush=True,
             )
     frames = np.concatenate([one.frames for one in runs])

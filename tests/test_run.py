@@ -1,0 +1,412 @@
+"""`dualcal run` and `dualcal estimate`, as a user meets them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dualcal_hal.cellfile import load_cell
+from dualcal_hal.errors import LinkLost
+from dualcal_hal.guard import GuardedRobot
+from dualcal_hal.session.captures import read_captures
+from dualcal_hal.session.folder import Session
+from procedures.calibrate import Calibration, captures_of
+from procedures.planning.model import CellModel
+from tests.cells import NOISELESS, PAPER, SMALL
+from tools.cli.app import app
+from tools.cli.run import execute
+
+REFERENCE = Path(__file__).parent / "data" / "reference-7x4.json"
+
+
+def sets(*overrides: str) -> list[str]:
+    return [part for override in overrides for part in ("--set", override)]
+
+
+def dualcal(*arguments: object):
+    """The command line in this process; a traceback would come out of it as one."""
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=True)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A finished run of the small cell."""
+    folder = tmp_path_factory.mktemp("run") / "session"
+    result = dualcal("run", PAPER, "--out", folder, "--seed", 3, *sets(*SMALL))
+    assert result.exit_code == 0, result.output
+    (folder / "output.txt").write_text(result.output)
+    return folder
+
+
+# -- a run -----------------------------------------------------------------------------------------
+
+
+def test_a_session_holds_what_was_used_done_seen_and_found(session):
+    for name in ("cell.yaml", "plan.json", "journal.jsonl", "captures.json", "result.json", "summary.png"):
+        assert (session / name).stat().st_size > 0, name
+    assert cv2.imread(str(session / "summary.png")) is not None
+
+
+def test_the_cell_file_in_the_session_is_the_one_used(session):
+    captures = json.loads((session / "captures.json").read_text())
+    assert captures["cell_sha256"] == hashlib.sha256((session / "cell.yaml").read_bytes()).hexdigest()
+    used = load_cell(session / "cell.yaml")
+    assert used.cell.procedure.seed == used.simulation.seed == 3
+    assert used.cell.procedure.constraints == 3
+    assert "# chosen" in used.text
+
+
+def test_every_capture_has_an_image_in_which_the_feature_is_where_it_says(session):
+    captures = read_captures(session / "captures.json").captures
+    assert [capture.use for capture in captures] == ["calibration"] * 9 + ["verification"] * 2
+    for capture in captures:
+        image = cv2.imread(str(session / "images" / f"{capture.id.replace('/', '-')}.png"), cv2.IMREAD_GRAYSCALE)
+        assert image.shape == (768, 1024)
+        corner = np.array([[capture.feature]], dtype=np.float32)
+        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
+        found = cv2.cornerSubPix(image, corner + 1.0, (6, 6), (-1, -1), criteria)
+        assert np.linalg.norm(found.ravel() - capture.feature) < 0.15
+
+
+def test_every_point_is_aligned_and_captures_of_one_arrival_share_its_number(session):
+    captures = read_captures(session / "captures.json").captures
+    assert all(np.max(np.abs(np.array(capture.feature) - [511.5, 383.5])) <= 0.1 for capture in captures)
+    arrivals = {capture.constraint: set() for capture in captures}
+    for capture in captures:
+        arrivals[capture.constraint].add(capture.active_arrival)
+    assert all(len(numbers) == 1 for numbers in arrivals.values())
+    assert len(set.union(*arrivals.values())) == len(arrivals)
+
+
+def test_the_result_is_complete_and_near_the_truth(session):
+    result = json.loads((session / "result.json").read_text())
+    assert result["format"] == "dualcal.result/1"
+    assert result["verdict"] == "ok"
+    assert result["truth_error"]["active_base_in_passive_base"]["translation_mm"] < 1.5
+    assert result["truth_error"]["active_base_in_passive_base"]["rotation_deg"] < 0.1
+    assert result["mismatch_mm"]["before"]["mean"] > 20
+    assert result["mismatch_mm"]["after"]["mean"] < 0.3
+    assert len(result["captures_used"]) == 9
+
+
+def test_the_output_shows_progress_and_both_tables(session):
+    output = (session / "output.txt").read_text()
+    assert re.search(r"calibration/\d\d position 1/3: aligned after \d pictures, offset 0\.\d+ px", output)
+    for words in ("w_x", "dp_P_A_y", "113.00", "Mismatch", "60.8", "Verdict: ok", str(session)):
+        assert words in output
+
+
+def test_the_plan_in_the_session_is_of_the_poses_that_were_captured(session):
+    plan = json.loads((session / "plan.json").read_text())
+    assert plan["provisional"] is False
+    assert [c["constraint"] for c in plan["constraints"]] == [f"calibration/0{i}" for i in range(3)] + [
+        "verification/00"
+    ]
+    first = read_captures(session / "captures.json").captures[0]
+    np.testing.assert_allclose(plan["constraints"][0]["active_joints_rad"], first.active_joints, atol=1e-4)
+
+
+def test_the_same_seed_gives_the_same_captures_to_the_last_bit(session, tmp_path):
+    dualcal("run", PAPER, "--out", tmp_path / "again", "--seed", 3, *sets(*SMALL))
+    once, again = (read_captures(folder / "captures.json").captures for folder in (session, tmp_path / "again"))
+    assert once == again
+
+
+def test_another_seed_gives_other_poses(session, tmp_path):
+    dualcal("run", PAPER, "--out", tmp_path / "other", "--seed", 4, *sets(*SMALL))
+    first, other = (json.loads((folder / "plan.json").read_text()) for folder in (session, tmp_path / "other"))
+    assert first["constraints"] != other["constraints"]
+
+
+def test_without_noise_the_mismatch_vanishes(tmp_path):
+    result = dualcal(
+        "run", PAPER, "--json", "--out", tmp_path / "s", *sets(*SMALL, *NOISELESS, "procedure.tolerance_px=0.01")
+    )
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["mismatch_mm"]["after"]["mean"] <= 0.01
+
+
+def test_a_lens_with_distortion_changes_nothing_for_the_user(tmp_path):
+    result = dualcal(
+        "run", PAPER, "--json", "--out", tmp_path / "s",
+        *sets(*SMALL, "camera.distortion=[-0.12, 0.05, 0.001, -0.0005, 0]"),
+    )  # fmt: skip
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["mismatch_mm"]["after"]["mean"] < 0.3
+
+
+def test_from_the_nominal_without_looks_every_point_is_aligned_or_replaced(tmp_path):
+    result = dualcal("run", PAPER, "--json", "--out", tmp_path / "s", *sets(*SMALL, "procedure.first_looks=0"))
+    assert result.exit_code == 0
+    assert len(json.loads(result.stdout)["captures_used"]) == 9
+    assert not list((tmp_path / "s" / "images").glob("looks*"))
+
+
+def test_a_run_without_verification_is_unverified_and_not_a_success(tmp_path):
+    result = dualcal(
+        "run", PAPER, "--json", "--out", tmp_path / "s", *sets(*SMALL, "procedure.verification.constraints=0")
+    )
+    document = json.loads(result.stdout)
+    assert (result.exit_code, document["verdict"], document["mismatch_mm"]) == (1, "unverified", None)
+
+
+def test_a_mismatch_above_the_limit_fails(tmp_path):
+    result = dualcal(
+        "run", PAPER, "--json", "--out", tmp_path / "s", *sets(*SMALL, "procedure.verification.limit_mm=0.0001")
+    )
+    assert (result.exit_code, json.loads(result.stdout)["verdict"]) == (1, "fail")
+
+
+def test_a_board_of_another_size_than_told_is_noticed_before_anything_is_planned(tmp_path, monkeypatch):
+    from backends.simulator.world import World
+
+    monkeypatch.setattr(World, "T_E_T", _further_away(World.T_E_T))
+    result = dualcal("run", PAPER, "--out", tmp_path / "s", *sets(*SMALL))
+    assert result.exit_code == 2
+    assert "square_mm" in result.stderr
+
+
+def _further_away(original):
+    """A board seen twenty percent nearer than it is looks twenty percent larger."""
+
+    def pose(self, *arguments):
+        T = np.array(original(self, *arguments))
+        T[:3, 3] *= 0.8
+        return T
+
+    return pose
+
+
+# -- going on with a run ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("finished", [0, 3, 7, 11])
+def test_a_run_begun_anew_on_its_journal_ends_with_the_same_captures(session, tmp_path, finished):
+    folder = tmp_path / "resumed"
+    shutil.copytree(session, folder)
+    lines = (session / "journal.jsonl").read_bytes().splitlines(keepends=True)
+    (folder / "journal.jsonl").write_bytes(b"".join(lines[: 1 + finished]))
+    file = load_cell(folder / "cell.yaml")
+    model = CellModel(file.cell)
+    resumed = Session(folder)
+    execute(file, model, Calibration(file.cell, model), resumed, lambda event: None)
+    captures = captures_of(resumed.journal, file.sha256, None).captures
+    assert captures == read_captures(session / "captures.json").captures
+
+
+# -- dry run ---------------------------------------------------------------------------------------
+
+
+def test_a_dry_run_opens_no_device_writes_nothing_and_shows_way_looks_and_plan(tmp_path, monkeypatch):
+    from backends.simulator import SimulatorBackend
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(SimulatorBackend, "open", lambda self, timeout: pytest.fail("a device was opened"))
+    result = dualcal("run", PAPER, "--dry-run", *sets(*SMALL))
+    assert result.exit_code == 0
+    assert list(tmp_path.iterdir()) == []
+    for words in ("stand-off", "Look 3 of 3", "rovisional", "calibration/02", "verification/00"):
+        assert words in result.stdout
+
+
+def test_a_dry_run_without_a_plan_from_the_nominal_still_shows_the_looks(monkeypatch):
+    from dualcal_hal.errors import NoPlan
+    from procedures.planning.poses import PosePlanner
+
+    def nothing(self, *arguments, **options):
+        raise NoPlan("no plan: 0 of 3")
+
+    monkeypatch.setattr(PosePlanner, "plan", nothing)
+    result = dualcal("run", PAPER, "--dry-run", *sets(*SMALL))
+    assert result.exit_code == 0
+    assert "no plan: 0 of 3" in result.stdout
+
+
+def test_a_dry_run_without_a_stand_off_fails():
+    far = "nominal.active_base_in_passive_base.translation_mm=[0, 0, 1200]"
+    result = dualcal("run", PAPER, "--dry-run", *sets(*SMALL, far))
+    assert result.exit_code == 2
+    assert "stand-off" in result.stderr
+
+
+# -- what goes wrong -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "nowhere.yaml"], "nowhere.yaml"),
+        (["run", PAPER, *sets("procedure.sed=1")], "--set procedure.sed"),
+        (["run", PAPER, *sets("procedure.tolerance_px=0.01")], "below twice the scatter"),
+        (["run", PAPER, *sets("backends.sim.type=simulatr")], "simulator"),
+        (["run", PAPER, "--method", "psychic"], "paper"),
+        (["estimate", "nowhere.json", "--cell", PAPER], "nowhere.json"),
+        (["estimate", REFERENCE], "--cell"),
+        (["estimate", REFERENCE, "--cell", PAPER, "--truth", "nowhere.json"], "nowhere.json"),
+        (["estimate", REFERENCE, "--cell", PAPER, "--method", "psychic"], "paper"),
+        (["estimate", REFERENCE, "--cell", PAPER, "--out", "/nowhere/result.json"], "cannot be written"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_words_with_exit_code_2(arguments, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = dualcal(*arguments)
+    assert result.exit_code == 2
+    assert words in result.stderr
+    assert "Traceback" not in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_with_something_in_it_is_not_written_to(session):
+    before = sorted(path.name for path in session.iterdir())
+    result = dualcal("run", PAPER, "--out", session)
+    assert result.exit_code == 2
+    assert "not an empty folder" in result.stderr
+    assert sorted(path.name for path in session.iterdir()) == before
+
+
+def test_a_lost_link_ends_the_run_with_exit_code_1_and_keeps_what_was_captured(tmp_path, monkeypatch):
+    start, moves = GuardedRobot.start, []
+
+    def lossy(self, path):
+        moves.append(self.name)
+        if len(moves) == 16:
+            raise LinkLost(self.name, "move", "no answer", "check the cable")
+        return start(self, path)
+
+    monkeypatch.setattr(GuardedRobot, "start", lossy)
+    result = dualcal("run", PAPER, "--out", tmp_path / "s", *sets(*SMALL))
+    assert result.exit_code == 1
+    assert "check the cable" in result.stderr
+    assert "the arms were stopped" in result.stderr
+    assert len(read_captures(tmp_path / "s" / "captures.json").captures) > 0
+    assert not (tmp_path / "s" / "result.json").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("ignored_before", [False, True])
+def test_a_signal_stops_the_arms_keeps_the_session_and_exits_with_130(tmp_path, number, ignored_before):
+    folder = tmp_path / "s"
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from tools.cli import main; main()", "run", PAPER, "--out", folder, "--seed", "1"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=PAPER.parent.parent,
+        # As a script's background job is started: with SIGINT ignored.
+        preexec_fn=(lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)) if ignored_before else None,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+    try:
+        for line in process.stdout:
+            if line.startswith("calibration/00 position 2"):
+                process.send_signal(number)
+                process.send_signal(number)
+                break
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        process.stderr.close()
+    assert process.returncode == 130
+    assert number.name in errors
+    assert "the arms were stopped" in errors
+    assert "Traceback" not in errors
+    assert len(read_captures(folder / "captures.json").captures) >= 2
+
+
+# -- estimate --------------------------------------------------------------------------------------
+
+
+def test_estimating_from_a_session_repeats_its_result(session, tmp_path):
+    result = dualcal("estimate", session, "--out", tmp_path / "again.json")
+    assert result.exit_code == 0
+    assert json.loads((tmp_path / "again.json").read_text()) == json.loads((session / "result.json").read_text())
+
+
+def test_a_session_that_was_killed_is_estimated_from_its_journal(session, tmp_path):
+    shutil.copytree(session, tmp_path / "killed")
+    (tmp_path / "killed" / "captures.json").unlink()
+    (tmp_path / "killed" / "result.json").unlink()
+    result = dualcal("estimate", tmp_path / "killed", "--json")
+    assert json.loads(result.stdout) == json.loads((session / "result.json").read_text())
+
+
+def test_the_reference_captures_give_the_expected_transforms(tmp_path):
+    result = dualcal("estimate", REFERENCE, "--cell", PAPER, "--out", tmp_path / "result.json")
+    assert result.exit_code == 0
+    found = json.loads((tmp_path / "result.json").read_text())
+    expected = json.loads(REFERENCE.read_text())["expected"]
+    np.testing.assert_allclose(
+        found["transforms"]["active_base_in_passive_base"]["matrix"],
+        expected["active_base_in_passive_base"],
+        atol=1e-9,
+    )
+    assert found["mismatch_mm"]["before"]["mean"] == pytest.approx(expected["mismatch_before_mm"]["mean"], abs=1e-6)
+    assert found["truth_error"] is None
+
+
+def test_a_truth_given_is_compared_with(tmp_path):
+    expected = json.loads(REFERENCE.read_text())["expected"]
+    names = ("active_base_in_passive_base", "camera_in_active_flange")
+    (tmp_path / "truth.json").write_text(json.dumps({name: expected[name] for name in names}))
+    result = dualcal("estimate", REFERENCE, "--cell", PAPER, "--truth", tmp_path / "truth.json", "--json")
+    error = json.loads(result.stdout)["truth_error"]
+    assert error["active_base_in_passive_base"]["translation_mm"] < 1e-6
+    assert error["camera_in_active_flange"]["sideways_mm"] < 1e-6
+
+
+def test_the_simulators_truth_changes_no_estimate(session, tmp_path):
+    text = (session / "cell.yaml").read_text()
+    changed = tmp_path / "cell.yaml"
+    changed.write_text(text.replace("translation_mm: [1218.2, 113.0, 11.5]", "translation_mm: [1100, 0, 0]"))
+    assert changed.read_text() != text
+    result = dualcal("estimate", session / "captures.json", "--cell", changed, "--json")
+    found, before = json.loads(result.stdout), json.loads((session / "result.json").read_text())
+    assert found["transforms"] == before["transforms"]
+    assert found["mismatch_mm"] == before["mismatch_mm"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d["captures"][4].update(active_joints_rad=[0.0] * 5), ["calibration/01/0"]),
+        (lambda d: d["captures"][5].update(passive_joints_rad=[float("nan")] * 6), ["calibration/01/1"]),
+        (lambda d: d.update(captures=[]), ["captures: is empty"]),
+        (lambda d: d.update(format="dualcal.captures/2"), ["dualcal.captures/2"]),
+        (lambda d: d.update(captures=d["captures"][:8]), ["2 constraints"]),
+    ],
+)
+def test_malformed_or_degenerate_captures_are_refused_and_nothing_is_written(tmp_path, change, words):
+    document = json.loads(REFERENCE.read_text())
+    change(document)
+    captures = tmp_path / "captures.json"
+    captures.write_text(json.dumps(document))
+    result = dualcal("estimate", captures, "--cell", PAPER, "--out", tmp_path / "result.json")
+    assert result.exit_code == 2
+    for word in words:
+        assert word in result.stderr
+    assert not (tmp_path / "result.json").exists()
+
+
+# -- schema ----------------------------------------------------------------------------------------
+
+
+def test_the_schema_is_printed_as_json():
+    schema = json.loads(dualcal("schema").stdout)
+    assert "procedure" in schema["properties"]

@@ -188,10 +188,12 @@ class Calibration:
 
     def _constraints(self, request: Request, queue: list[PlannedConstraint]) -> Procedure[None]:
         """Capture as many constraints as requested; one that fails is replaced by another."""
-        finished, given_up, next_number = 0, 0, len(queue)
-        while finished < request.constraints:
+        captured: tuple[PlannedConstraint, ...] = ()
+        given_up, next_number = 0, len(queue)
+        while len(captured) < request.constraints:
             if not queue or self._is_outdated(queue[0]):
-                missing = Request(request.use, request.constraints - finished, request.positions, next_number)
+                count = request.constraints - len(captured)
+                missing = Request(request.use, count, request.positions, next_number, captured)
                 key = StepKey("plan", f"{request.use}/{next_number:02d}", None, "replacement")
                 again = yield from task(key, lambda r=missing, k=key: self._plan([r], k.constraint), Plan)  # type: ignore[misc]
                 queue = list(again.constraints)
@@ -199,8 +201,8 @@ class Calibration:
             constraint = queue.pop(0)
             failure = yield from self._constraint(constraint)
             if failure is None:
-                finished += 1
-                yield from tell(ConstraintDone(request.use, constraint.name, finished, request.constraints))
+                captured = (*captured, constraint)
+                yield from tell(ConstraintDone(request.use, constraint.name, len(captured), request.constraints))
             else:
                 given_up += 1
                 yield from tell(ConstraintGivenUp(constraint.name, failure))

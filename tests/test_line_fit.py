@@ -64,7 +64,7 @@ def test_coincident_positions_are_refused_with_and_without_noise(noise: float, c
     rng = np.random.default_rng(0)
     for _ in range(200):
         with pytest.raises(Degenerate, match="coincident positions: only 1 of"):
-            fit_line([1, 2, 3] + rng.normal(0, noise, (count, 3)), [1, 0, 0])
+            fit_line(rng.normal([1, 2, 3], noise, (count, 3)), [1, 0, 0])
 
 
 def test_positions_that_coincide_in_pairs_count_once() -> None:

@@ -44,12 +44,17 @@ _POOL = 2.5  # candidates to choose from, per constraint wanted
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """How many constraints of a use, each with how many positions."""
+    """How many constraints of a use, each with how many positions.
+
+    Their names count from ``first_number``; ``captured`` are constraints of this use that there are already, which
+    the new ones shall complete.
+    """
 
     use: Use
     constraints: int
     positions: int
     first_number: int = 0
+    captured: tuple[PlannedConstraint, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,8 +221,9 @@ class PosePlanner:
         self, pool: list[_Candidate], request: Request, start: Posture
     ) -> tuple[list[PlannedConstraint], Posture]:
         """The best-conditioned choice from the pool that can be visited in some order from ``start``."""
+        known = self._known(request.captured)
         while True:
-            chosen = _most_informative(pool, request.constraints)
+            chosen = _most_informative(pool, request.constraints, known)
             ordered, lost, end = self._order(chosen, start)
             if not lost:
                 break
@@ -245,10 +251,20 @@ class PosePlanner:
             posture = Posture.of(candidate.active, candidate.passive[-1])
         return ordered, left, posture
 
+    def _known(self, captured: Sequence[PlannedConstraint]) -> Array:
+        """What captured constraints tell already, (12, 12)."""
+        model, total = self._model, np.zeros((12, 12))
+        for constraint in captured:
+            T_P_E = model.camera_in_passive(constraint.active, self._belief)
+            distances = np.array([[position.distance] for position in constraint.positions])
+            total += _information(T_P_E, self._belief, T_P_E[:3, 3] + distances * T_P_E[:3, 2])
+        return total
+
     def _require_turns(self, chosen: list[_Candidate], request: Request) -> None:
-        if request.use != "calibration" or request.constraints < 3:
+        if request.use != "calibration":
             return
-        R = self._model.active.chain.forward(np.stack([c.active for c in chosen]))[:, :3, :3]
+        active = np.array([*(constraint.active for constraint in request.captured), *(c.active for c in chosen)])
+        R = self._model.active.chain.forward(active)[:, :3, :3]
         turned = turned_about_two_axes(R)
         if turned < LEAST_TURN:
             self.refused["the flange is not turned by 30 degrees about two axes"] += 1
@@ -333,9 +349,9 @@ def _information(T_P_E: Array, belief: Belief, points: Array) -> Array:
     return np.asarray(J.T @ J)
 
 
-def _most_informative(pool: list[_Candidate], count: int) -> list[_Candidate]:
-    """Greedy choice by the determinant of the information (D-optimality), from the pool's random candidates."""
-    total = 1e-3 * np.eye(12)
+def _most_informative(pool: list[_Candidate], count: int, known: Array) -> list[_Candidate]:
+    """Greedy choice by the determinant of the information (D-optimality) on top of what is known already."""
+    total = known + 1e-3 * np.eye(12)
     left, chosen = list(pool), []
     for _ in range(min(count, len(left))):
         gains = np.linalg.slogdet(total + np.stack([c.information for c in left]))[1]

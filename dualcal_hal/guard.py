@@ -145,21 +145,22 @@ class GuardedRobot(Robot):
 
     def _check_values(self, path: JointPath) -> None:
         limits = self._limits
-        for what, values in (*(("waypoint", w) for w in path.waypoints), ("speed", path.speed)):
+        if not path.waypoints:
+            self._refuse("the path is empty")
+        numbers = [("waypoint", w) for w in path.waypoints]
+        for what, values in (*numbers, ("speed", path.speed), ("acceleration", path.acceleration)):
             if len(values) != self.joints or not np.all(np.isfinite(values)):
-                self._refuse(f"a {what} is not {self.joints} finite numbers: {values}")
+                self._refuse(f"the {what} is not {self.joints} finite numbers: {values}")
         waypoints = np.array(path.waypoints)
         beyond = np.maximum(limits.lower - waypoints, waypoints - limits.upper)
-        if len(path.waypoints) == 0:
-            self._refuse("the path is empty")
         if np.max(beyond) > _LIMIT_TOLERANCE:
             joint = int(np.unravel_index(np.argmax(beyond), beyond.shape)[1])
             self._refuse(f"joint {joint + 1} would be {np.rad2deg(np.max(beyond)):.3f} deg beyond its limit")
-        for what, values, largest in (
+        for what, bound, largest in (
             ("speed", path.speed, limits.speed),
             ("acceleration", path.acceleration, limits.acceleration),
         ):
-            if np.any(np.asarray(values) > largest * (1 + 1e-9)) or np.any(np.asarray(values) <= 0):
+            if np.any(np.asarray(bound) > largest * (1 + 1e-9)) or np.any(np.asarray(bound) <= 0):
                 self._refuse(f"the {what} is not between zero and the arm's own")
 
     def _refuse(self, why: str) -> None:

@@ -156,7 +156,7 @@ def test_values_come_out_in_metres_and_radians(path: Path) -> None:
     np.testing.assert_allclose(right.target_mount_transform[:3, 3], [0, 0, 0.003])
     np.testing.assert_allclose(right.target_mount_transform[:3, 0], [0, -1, 0], atol=1e-15)
     np.testing.assert_allclose(cell.camera.intrinsics.principal_point, [320, 240])
-    assert (cell.camera.body_radius, cell.camera.body_length) == (0.045, 0.03)
+    assert (cell.camera.body_radius, cell.camera.body_length) == pytest.approx((0.035, 0.02))
     assert (cell.target.board.square, cell.target.board.feature, cell.target.margin) == (0.025, 7, 0.01)
     procedure = cell.procedure
     assert (procedure.distance, procedure.clearance, procedure.first_looks) == ((0.3, 0.5), 0.02, 5)

@@ -315,7 +315,7 @@ class TestUnusualButGoodSets:
 
 
 def fan(roll: float = 0.0, tilt: float = 0.0) -> Array:
-    """Seven flanges over 60 degrees about one axis, with roll about, or tilt across, the optical axis to either side."""
+    """Seven flanges over 60 degrees about one axis, with roll about or tilt across the optical axis to either side."""
     turns = np.radians(np.linspace(-30, 30, 7))[:, None] * [0, 1, 0]
     sides = np.radians([1, -1, 1, -1, 1, -1, 1])[:, None]
     return rotation_from_vector(turns) @ rotation_from_vector(sides * [tilt, 0, 0] + sides * roll * T_H_E[:3, 2])

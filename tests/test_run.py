@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -301,15 +301,15 @@ def test_a_lost_link_ends_the_run_with_exit_code_1_and_keeps_what_was_captured(t
 @pytest.mark.parametrize("ignored_before", [False, True])
 def test_a_signal_stops_the_arms_keeps_the_session_and_exits_with_130(tmp_path, number, ignored_before):
     folder = tmp_path / "s"
+    # As a script's background job is started: with SIGINT ignored.
+    ignoring = "trap '' INT; " if ignored_before else ""
+    program = shlex.join([sys.executable, "-u", "-c", "from tools.cli import main; main()"])
     process = subprocess.Popen(
-        [sys.executable, "-c", "from tools.cli import main; main()", "run", PAPER, "--out", folder, "--seed", "1"],
+        ["sh", "-c", f"{ignoring}exec {program} run {shlex.quote(str(PAPER))} --out {shlex.quote(str(folder))}"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         cwd=PAPER.parent.parent,
-        # As a script's background job is started: with SIGINT ignored.
-        preexec_fn=(lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)) if ignored_before else None,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )
     try:
         for line in process.stdout:

@@ -17,16 +17,16 @@ from procedures.estimation.translation import RANK, TranslationStep, estimate_tr
 FEWEST_CONSTRAINTS = 3
 
 # How far, rms, that axis wanders between the constraints about which the flanges turn most nearly. Measured, 200 sets
-# each of 3 to 7 constraints: flanges turned about one axis or not at all 4e-8 without noise, 2e-4 with 0.1 mrad, 6e-4 with
-# 0.3 mrad; fans with 5 deg about a second axis 0.039 at least; turns of 15 to 40 deg about random axes 0.043.
+# each of 3 to 7 constraints: flanges turned about one axis or not at all 4e-8 without noise, 2e-4 with 0.1 mrad, 6e-4
+# with 0.3 mrad; fans with 5 deg about a second axis 0.039 at least; turns of 15 to 40 deg about random axes 0.043.
 ONE_AXIS = 0.005  # rad
 
 # Smallest over largest singular value of a step, below which even exact captures say nothing. For a given optical
 # axis there are such sets besides those turned about one axis.
 DEGENERATE = 0.001
 
-# Sigma of the weakest direction of the rotation step. Measured with 0.1 mrad and 0.1 mm of noise: turns about random axes
-# 0.021 at most, of 400 sets; two of three fans that tilt by 5 deg without roll above, with errors of 2 to 14 deg.
+# Sigma of the weakest direction of the rotation step. Measured with 0.1 mrad and 0.1 mm of noise: turns about random
+# axes 0.021 at most, of 400 sets; most fans that tilt by 5 deg without roll are above, with errors of 2 to 14 deg.
 UNCERTAIN = 0.05  # rad
 
 # Warned of below WEAK: fans with 5 deg about a second axis have up to 0.031; 7 random orientations 0.065 in 19 of

@@ -1,0 +1,191 @@
+"""The guard: nothing unsafe is sent, and no configuration takes it away."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dualcal_hal.cell import Cell
+from dualcal_hal.clock import VirtualClock
+from dualcal_hal.errors import CommandRefused
+from dualcal_hal.guard import PLANNERS_SHARE, GuardedRobot, JointLimits, Placement
+from dualcal_hal.robot import JointPath, Mode, Motion, Robot, RobotState, StopResult
+from procedures.planning.model import CellModel
+from tests.cells import paper_cell
+
+
+class Recording(Robot):
+    """A robot that reports what it is told to report and remembers what was sent."""
+
+    def __init__(self, clock: VirtualClock, positions=(0.0, 0.0)):
+        self.name, self.clock, self.positions = "arm", clock, positions
+        self.mode, self.faults, self.age, self.sent = Mode.READY, (), 0.0, []
+
+    @property
+    def joints(self):
+        return len(self.positions)
+
+    def read(self, timeout):
+        rest = (0.0,) * self.joints
+        return RobotState(self.positions, rest, self.mode, self.faults, self.clock.now() - self.age, 1)
+
+    def start(self, path):
+        self.sent.append(path)
+        return Motion(self.name, self.clock)
+
+    def stop(self, reason):
+        return StopResult(True, reason)
+
+    def subscribe(self, function):
+        return lambda: None
+
+    def enable(self, timeout):
+        self.mode = Mode.READY
+
+    def disable(self, timeout):
+        self.mode = Mode.DISABLED
+
+    def reset_fault(self, timeout):
+        self.faults = ()
+
+
+LIMITS = JointLimits(np.array([-1.0, -2.0]), np.array([1.0, 2.0]), np.array([1.0, 1.0]), np.array([5.0, 5.0]))
+
+
+@pytest.fixture
+def device():
+    return Recording(VirtualClock())
+
+
+@pytest.fixture
+def guarded(device):
+    robot = GuardedRobot(device, LIMITS, device.clock)
+    robot.admit(lambda path: None)
+    return robot
+
+
+def path(*waypoints, speed=(1.0, 1.0), acceleration=(5.0, 5.0)):
+    return JointPath(waypoints, speed, acceleration)
+
+
+def test_a_path_within_everything_is_sent_as_it_is(device, guarded):
+    wanted = path((0.5, -1.5), (1.0, 2.0))
+    guarded.start(wanted)
+    assert device.sent == [wanted]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (path((1.1, 0.0)), r"joint 1 would be 5\.730 deg beyond its limit"),
+        (path((0.0, 0.0), (0.0, -2.5)), "joint 2 would be .* beyond"),
+        (path((float("nan"), 0.0)), "finite"),
+        (path((float("inf"), 0.0)), "finite"),
+        (path((0.0,)), "2 finite numbers"),
+        (path((0.0, 0.0, 0.0)), "2 finite numbers"),
+        (path(), "empty"),
+        (path((0.1, 0.1), speed=(1.2, 1.0)), "speed"),
+        (path((0.1, 0.1), speed=(0.0, 1.0)), "speed"),
+        (path((0.1, 0.1), speed=(float("nan"), 1.0)), "speed"),
+        (path((0.1, 0.1), acceleration=(9.0, 5.0)), "acceleration"),
+        (path((0.1, 0.1), acceleration=(float("nan"), 5.0)), "acceleration"),
+        (path((0.1, 0.1), acceleration=(5.0,)), "acceleration"),
+    ],
+)
+def test_values_that_must_not_be_sent_are_refused_and_nothing_is_sent(device, guarded, wrong, words):
+    with pytest.raises(CommandRefused, match=words):
+        guarded.start(wrong)
+    assert device.sent == []
+
+
+@pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.READY])
+def test_an_arm_in_any_mode_but_ready_is_not_moved(device, guarded, mode):
+    device.mode = mode
+    with pytest.raises(CommandRefused, match=f"not ready.*{mode}"):
+        guarded.start(path((0.1, 0.1)))
+    assert device.sent == []
+
+
+def test_an_arm_with_a_fault_is_not_moved(device, guarded):
+    device.faults = ("overcurrent in joint 2",)
+    with pytest.raises(CommandRefused, match="overcurrent in joint 2"):
+        guarded.start(path((0.1, 0.1)))
+
+
+def test_an_arm_whose_state_is_old_is_not_moved(device, guarded):
+    device.age = 0.2
+    with pytest.raises(CommandRefused, match=r"state is 0\.20 s old"):
+        guarded.start(path((0.1, 0.1)))
+    assert device.sent == []
+
+
+def test_before_the_cell_is_put_together_nothing_moves(device):
+    with pytest.raises(CommandRefused, match="not open"):
+        GuardedRobot(device, LIMITS, device.clock).start(path((0.1, 0.1)))
+
+
+def test_the_whole_path_is_judged_from_where_the_arm_stands(device):
+    judged = []
+    robot = GuardedRobot(device, LIMITS, device.clock)
+    robot.admit(judged.append)
+    device.positions = (0.4, 0.4)
+    robot.start(path((0.8, -0.4), (0.0, 0.0)))
+    np.testing.assert_allclose(judged[0][0], [0.4, 0.4])
+    assert any(np.allclose(q, [0.8, -0.4]) for q in judged[0])
+    np.testing.assert_allclose(judged[0][-1], [0.0, 0.0])
+    assert np.max(np.abs(np.diff(judged[0], axis=0))) <= 0.05 + 1e-12
+
+
+@pytest.fixture
+def cell():
+    file = paper_cell()
+    model = CellModel(file.cell)
+    with Cell(file, Placement(model.geometry(model.nominal), model.nominal.T_P_A)) as opened:
+        yield opened
+
+
+REACHING = (0.0, -1.2, 0.8, 0.0, 0.0, 0.0)
+
+
+def full_speed(arm, *waypoints):
+    return JointPath(waypoints, tuple(arm.limits.speed), tuple(arm.limits.acceleration))
+
+
+def test_an_arm_is_not_sent_into_the_other(cell):
+    cell.active.robot.start(full_speed(cell.active, REACHING)).wait(20)
+    with pytest.raises(CommandRefused, match="mm of the other arm"):
+        cell.passive.robot.start(full_speed(cell.passive, REACHING))
+
+
+def test_where_the_other_arm_stands_follows_from_the_transforms_believed_now(cell):
+    cell.active.robot.start(full_speed(cell.active, REACHING)).wait(20)
+    model = CellModel(paper_cell().cell)
+    far = model.nominal.T_P_A.copy()
+    far[0, 3] += 1.0
+    cell.guard.place(Placement(model.geometry(model.nominal), far))
+    cell.passive.robot.start(full_speed(cell.passive, REACHING)).wait(20)
+
+
+def test_an_arm_is_not_sent_into_the_floor(cell):
+    with pytest.raises(CommandRefused, match="floor"):
+        cell.active.robot.start(full_speed(cell.active, (0.0, -1.9, 0.0, 0.0, 0.5, 0.0)))
+
+
+def test_the_guard_insists_on_a_part_of_the_planners_clearance(cell):
+    assert 0 < PLANNERS_SHARE < 1
+    geometry = CellModel(paper_cell().cell).geometry(CellModel(paper_cell().cell).nominal)
+    cell.active.robot.start(full_speed(cell.active, (0.0, -0.75, 0.2, 0.0, 0.6, 0.0))).wait(20)
+    T_P_A = CellModel(paper_cell().cell).nominal.T_P_A
+    allowed = refused = None
+    for bend in np.linspace(0.0, -1.2, 240):
+        goal = (0.0, float(bend), 0.2, 0.0, 0.6, 0.0)
+        clearance = geometry.between([(0.0, -0.75, 0.2, 0.0, 0.6, 0.0)], [goal], T_P_A)[0]
+        try:
+            cell.passive.robot.start(full_speed(cell.passive, goal)).wait(20)
+            allowed = clearance
+        except CommandRefused:
+            refused = clearance
+            break
+    assert allowed is not None
+    assert refused is not None
+    assert refused < 0.02 * PLANNERS_SHARE + 1e-3 <= allowed + 2e-3

@@ -8,45 +8,22 @@ import numpy as np
 from backends.simulator.rendering import Renderer
 from dualcal_hal.camera import Image, Intrinsics
 from dualcal_hal.target import Checkerboard
-from dualcal_hal.transforms import Array, rotation_from_vector, transform
+from dualcal_hal.transforms import Array
+from tools.benchmarks.corners import DISTORTION, FACING, project, random_view
 
 MARGIN = 0.6  # squares of white around the pattern
 NOISE = 2.0  # grey levels
-FACING = np.diag([1.0, -1.0, -1.0])  # R_E_T of a board seen straight from the front, upright
 
 
 def intrinsics(size: tuple[int, int] = (1024, 768), distorted: bool = True) -> Intrinsics:
     width, height = size
     f = 812.0 * width / 1024
     matrix = np.array([[f, 0.0, (width - 1) / 2], [0.0, f, (height - 1) / 2], [0.0, 0.0, 1.0]])
-    distortion = np.array([-0.12, 0.05, 0.001, -0.0005, 0.0]) if distorted else np.zeros(5)
+    distortion = DISTORTION if distorted else np.zeros(5)
     return Intrinsics(matrix, distortion, size)
 
 
-def project(board: Checkerboard, camera: Intrinsics, T_E_T: Array, points: Array | None = None) -> Array:
-    """(n, 2) px of the corners, or of ``points`` (n, 3) in T."""
-    rvec, _ = cv2.Rodrigues(T_E_T[:3, :3])
-    points = board.corners if points is None else points
-    pixels, _ = cv2.projectPoints(points, rvec, T_E_T[:3, 3], camera.matrix, camera.distortion)
-    return np.asarray(pixels, dtype=float).reshape(-1, 2)
-
-
-def random_view(
-    rng: np.random.Generator,
-    board: Checkerboard,
-    camera: Intrinsics,
-) -> Array:
-    """T_E_T (4, 4) at 0.3 to 0.5 m, tilted by up to 45 deg, with the pattern and a rim in view."""
-    rim = board.outline + 0.25 * board.square * np.sign(board.outline - board.outline.mean(axis=0))
-    while True:
-        tilt_axis = rng.uniform(-np.pi, np.pi)
-        tilt = np.deg2rad(rng.uniform(0.0, 45.0)) * np.array([np.cos(tilt_axis), np.sin(tilt_axis), 0.0])
-        R = rotation_from_vector([0.0, 0.0, rng.uniform(-np.pi, np.pi)]) @ rotation_from_vector(tilt) @ FACING
-        direction = np.array([*rng.uniform(-0.6, 0.6, 2), 1.0])
-        T_E_T = transform(R, rng.uniform(0.3, 0.5) * direction)
-        pixels = project(board, camera, T_E_T, rim)
-        if np.all(pixels > 0) and np.all(pixels < np.array(camera.size) - 1):
-            return T_E_T
+__all__ = ["FACING", "MARGIN", "NOISE", "Scene", "clutter", "intrinsics", "project", "random_view"]
 
 
 class Scene:

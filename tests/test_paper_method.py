@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -95,14 +93,6 @@ class TestReference:
         shuffled = Data(data.active[order], data.passive[order], tuple(data.constraints[i] for i in order))
         np.testing.assert_allclose(run(shuffled).T_P_A, run(data).T_P_A, atol=1e-9)
 
-    def test_it_takes_less_than_a_quarter_of_a_second(self) -> None:
-        # 3 ms measured; the benchmark has the figure, this catches an iteration that crawls.
-        data = reference("calibration")
-        T_A_H, T_P_T = data.T_A_H, data.T_P_T
-        start = time.perf_counter()
-        estimate(T_A_H, T_P_T, data.constraints, NOMINAL_T_P_A, NOMINAL_T_H_E)
-        assert time.perf_counter() - start < 0.25
-
 
 class TestNoise:
     def test_the_camera_along_its_axis_stays_within_a_millimetre_of_the_nominal(self) -> None:
@@ -190,12 +180,7 @@ def spread_flanges(rng: np.random.Generator, count: int) -> Array:
     """Turned by 30 degrees about two axes, and at random within 40 degrees."""
     fixed = np.radians(30) * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, -1, 0]])
     others = np.radians(40) * rng.uniform(size=(count - 4, 1)) * unit(rng.normal(size=(count - 4, 3)))
-    # About axes across the optical axis, which itself would not be turned by a roll.
-    return any_orientation(rng) @ rotation_from_vector(np.vstack([fixed, others])) @ _onto_axis(rng)
-
-
-def _onto_axis(rng: np.random.Generator) -> Array:
-    return rotation_from_vector([0, 0, rng.uniform(-np.pi, np.pi)])
+    return any_orientation(rng) @ rotation_from_vector(np.vstack([fixed, others]))
 
 
 def one_axis(rng: np.random.Generator, count: int) -> Array:

@@ -237,11 +237,15 @@ def test_orientations_turned_about_one_axis_only_are_not_turned_about_two(angle)
 
 
 def test_no_way_leads_through_the_other_arm(model):
-    ways = WayFinder(model, model.nominal, [])
-    reach_a = np.array([0.0, -1.2, 0.2, 0.0, 0.6, 0.0])
-    touching = Posture.of(reach_a, [0.0, -1.2, 0.2, 0.0, 0.6, 0.0])
-    assert model.geometry(model.nominal).between([touching.active], [touching.passive], model.nominal.T_P_A)[0] < 0
-    assert ways.find(model.home, touching) is None
+    reaching = (0.0, -1.2, 0.8, 0.0, 0.0, 0.0)
+    touching = Posture.of(reaching, reaching)
+    geometry = model.geometry(model.nominal)
+    assert geometry.between([reaching], [reaching], model.nominal.T_P_A)[0] < 0
+    assert WayFinder(model, model.nominal, []).find(model.home, touching) is None
+    apart = model.nominal.T_P_A.copy()
+    apart[0, 3] += 1.0
+    far = Belief(apart, model.nominal.T_H_E, model.nominal.covariance, "a test")
+    assert WayFinder(model, far, []).find(model.home, touching) is not None
 
 
 def test_an_arm_at_its_goal_is_not_moved(model, plan):

@@ -17,7 +17,7 @@ FEWEST_POSITIONS = 3
 APART = 0.005  # m
 
 # Ratio of the spread across to the spread along the line above which there is no line. Measured: aligned
-# positions 0.005 at most (0.1 px, 0.1 mrad, 7 lines x 200 runs); three corners of a square 0.58.
+# positions 0.002 at most (0.1 px, 0.1 mrad, 7 lines x 200 runs); three corners of a square 0.58.
 STRAIGHT = 0.1
 
 

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from dualcal_hal.transforms import Array, nearest_rotation, smallest_rotation, transform
 from procedures.estimation.degenerate import Degenerate
 from procedures.estimation.line import fit_line
-from procedures.estimation.rotation import Iteration, RotationStep, estimate_rotation
-from procedures.estimation.translation import RANK, TranslationStep, estimate_translation
+from procedures.estimation.rotation import Iteration, estimate_rotation
+from procedures.estimation.translation import RANK, estimate_translation
 
 FEWEST_CONSTRAINTS = 3
 
@@ -32,6 +32,8 @@ UNCERTAIN = 0.05  # rad
 # Warned of below WEAK: fans with 5 deg about a second axis have up to 0.031; 7 random orientations 0.065 in 19 of
 # 20 sets, the reference captures 0.41.
 WEAK = 0.04
+
+_TOO_WEAK = "the active flange is turned too little about a second axis"
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,8 @@ def estimate(
     _refuse_one_axis(flanges, directions)
 
     rotation = estimate_rotation(directions, flanges, T_P_A[:3, :3], T_H_E[:3, 2])
+    conditioning = _conditioning(rotation.singular_values)
+    _refuse_uncertain(rotation.uncertainty)
 
     of_capture = np.empty((len(T_A_H), 3))
     for m, direction in zip(members.values(), directions, strict=True):
@@ -97,7 +101,7 @@ def estimate(
     translation = estimate_translation(
         of_capture, T_A_H, T_P_T[:, :3, 3], rotation.R_P_A, rotation.z_H_E, T_P_A[:3, 3], T_H_E[:3, 3]
     )
-    conditioning = _conditioning(rotation, translation)
+    conditioning = min(conditioning, _conditioning(translation.singular_values[:RANK]))
     R_H_E = smallest_rotation(T_H_E[:3, 2], rotation.z_H_E) @ T_H_E[:3, :3]
     return Estimate(
         T_P_A=transform(rotation.R_P_A, translation.p_P_A),
@@ -151,19 +155,18 @@ def _refuse_one_axis(flanges: Array, directions: Array) -> None:
     raise Degenerate(f"{reason} (that axis wanders by {1e3 * wander[0]:.2g} mrad, {1e3 * ONE_AXIS:g} are needed)")
 
 
-def _conditioning(rotation: RotationStep, translation: TranslationStep) -> float:
-    """The lower ratio of smallest to largest singular value of both steps; refused where nothing can be said."""
-    steps = (rotation.singular_values, translation.singular_values[:RANK])
-    conditioning = min(float(values[-1] / values[0]) for values in steps)
+def _conditioning(singular_values: Array) -> float:
+    """Smallest over largest; Degenerate where even exact captures say nothing."""
+    conditioning = float(singular_values[-1] / singular_values[0])
     if conditioning < DEGENERATE:
         raise Degenerate(f"{_TOO_WEAK} (conditioning {conditioning:.1e}, at least {DEGENERATE:g} is needed)")
-    if rotation.uncertainty > UNCERTAIN:
-        sigma, most = np.degrees(rotation.uncertainty), np.degrees(UNCERTAIN)
-        raise Degenerate(f"{_TOO_WEAK} (uncertain by {sigma:.1f} deg, at most {most:.1f} deg are accepted)")
     return conditioning
 
 
-_TOO_WEAK = "the active flange is turned too little about a second axis"
+def _refuse_uncertain(sigma: float) -> None:
+    if sigma > UNCERTAIN:
+        found, most = np.degrees(sigma), np.degrees(UNCERTAIN)
+        raise Degenerate(f"{_TOO_WEAK} (uncertain by {found:.1f} deg, at most {most:.1f} deg are accepted)")
 
 
 def _warnings(conditioning: float) -> tuple[str, ...]:

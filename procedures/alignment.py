@@ -7,7 +7,7 @@ moves bring about (Broyden) and kept along the constraint.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -15,13 +15,14 @@ import numpy as np
 from dualcal_hal.errors import UsageError
 from dualcal_hal.robot import Joints
 from dualcal_hal.transforms import Array, inverse, rotation_angle, transform
-from procedures.detection import Detection, Detector, Missed, board_poses
+from procedures.detection import Detection, Detector, board_poses
 from procedures.estimation.projection import undistort
 from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel, Posture
 from procedures.planning.refine import arrival_scatter
 from procedures.planning.ways import WayFinder
-from procedures.steps import Procedure, Sighting, look, move, read
+from procedures.seeing import see
+from procedures.steps import Procedure, Sighting, move, read
 
 MOST_FRAMES = 12
 ACCEPTABLE_PX = 1.0
@@ -52,7 +53,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """What came of one point. ``sighting`` and ``detection`` are of the last picture, if the target was seen there."""
+    """What came of one point. ``sighting`` and ``detection`` are of the last picture that showed the target."""
 
     outcome: Outcome
     frames: int
@@ -183,11 +184,15 @@ class Aligner:
             if joints is None or blocked:
                 return Alignment(Outcome.OUT_OF_REACH, frames, reply.offset, blocked)
             near = joints
-            sighting = yield from look()
+            picture = yield from see(self._model, self._detector, self._belief)
             frames += 1
-            seen = self._detect(sighting)
-            if isinstance(seen, Missed):
-                return Alignment(Outcome.LOST, frames, reply.offset, f"{seen.reason}: {seen.detail}", sighting)
+            if picture.sighting is None:
+                # An arm was not at rest yet; the same place is tried again.
+                reply = replace(reply, frames=frames, reason=picture.reason)
+                continue
+            if picture.detection is None:
+                return Alignment(Outcome.LOST, frames, reply.offset, picture.reason)
+            sighting, seen = picture.sighting, picture.detection
             offset = seen.feature - self._model.intrinsics.principal_point
             if np.all(np.abs(offset) <= self._tolerance):
                 return Alignment(Outcome.ALIGNED, frames, offset, "", sighting, seen)
@@ -218,10 +223,6 @@ class Aligner:
         for leg in way:
             yield from move(leg.arm, leg.goal)
         return ""
-
-    def _detect(self, sighting: Sighting) -> Detection | Missed:
-        predicted = self._model.predict_corners(sighting.active, sighting.passive, self._belief)
-        return self._detector.detect(sighting.frame.image, predicted if np.all(np.isfinite(predicted)) else None)
 
     def _lateral(self, sighting: Sighting, seen: Detection) -> tuple[Array, Servo]:
         """The feature's offset across the axis (2,) in m, and the constraint's servo."""

@@ -19,7 +19,7 @@ from dualcal_hal.session.captures import CaptureRecord, Captures
 from dualcal_hal.session.journal import Journal, StepKey
 from dualcal_hal.transforms import Array
 from procedures.alignment import Aligner, Alignment, AxisTrack, Outcome, point_on_axis, target_on_axis, tolerance_px
-from procedures.detection import Detection, Detector
+from procedures.detection import Detector
 from procedures.events import BeliefRefined, ConstraintDone, ConstraintGivenUp, LookTaken, PlanReady, PointDone
 from procedures.planning.belief import Belief
 from procedures.planning.first_look import find_stand_off, look_postures
@@ -28,7 +28,8 @@ from procedures.planning.plan import Plan, PlannedConstraint
 from procedures.planning.poses import ROOM, PosePlanner, Request
 from procedures.planning.refine import WORST_FIT, View, arrival_scatter, refine
 from procedures.planning.ways import WayFinder
-from procedures.steps import Believe, KeepDocument, KeepImage, Procedure, look, move, read, task, tell
+from procedures.seeing import see
+from procedures.steps import Believe, KeepDocument, KeepImage, Procedure, move, read, task, tell
 
 LEAST_LOOKS = 3
 _TRIES_A_LOOK = 20
@@ -125,9 +126,8 @@ class Calibration:
         if self._procedure.first_looks:
             yield from self._first_look()
         wanted = requests_of(self._procedure)
-        planned = yield from task(StepKey("plan", None, None, "plan"), lambda: self._plan(wanted, "plan"), Plan)
-        yield KeepDocument("plan.json", planned.to_record())
-        yield from tell(PlanReady(planned))
+        planned = yield from task(StepKey("plan", None, None, "plan"), lambda: self._select(wanted, "plan"), Plan)
+        yield from self._adopt_plan(planned)
         for request in wanted:
             yield from self._constraints(request, list(planned.of(request.use)))
         yield from self._go_home()
@@ -168,23 +168,26 @@ class Calibration:
         for posture in itertools.islice(postures, _TRIES_A_LOOK):
             if not (yield from self._go(posture)):
                 continue
-            sighting = yield from look()
-            predicted = self._model.predict_corners(sighting.active, sighting.passive, self._belief)
-            usable = predicted if np.all(np.isfinite(predicted)) else None
-            seen = self._detector.detect(sighting.frame.image, usable)
-            if isinstance(seen, Detection):
-                yield KeepImage(f"looks/{number}", sighting.frame.image)
-                return LookRecord(View(sighting.active, sighting.passive, seen.corners), "")
-            reason = f"{seen.reason}: {seen.detail}"
+            picture = yield from see(self._model, self._detector, self._belief)
+            if picture.sighting is not None and picture.detection is not None:
+                yield KeepImage(f"looks/{number}", picture.sighting.frame.image)
+                joints = picture.sighting.active, picture.sighting.passive
+                return LookRecord(View(*joints, picture.detection.corners), "")
+            reason = picture.reason
         return LookRecord(None, reason)
 
     # -- constraints --------------------------------------------------------------------------------------------
 
-    def _plan(self, requests: list[Request], purpose: str) -> Procedure[Plan]:
+    def _select(self, requests: list[Request], purpose: str) -> Procedure[Plan]:
         here = yield from self._here()
         seed = [self._procedure.seed, *purpose.encode()]
         planner = PosePlanner(self._model, self._belief, self._ways, seed)
         return planner.plan(requests, here, provisional=False)
+
+    def _adopt_plan(self, plan: Plan) -> Procedure[None]:
+        self._plan = plan
+        yield KeepDocument("plan.json", plan.to_record())
+        yield from tell(PlanReady(plan))
 
     def _constraints(self, request: Request, queue: list[PlannedConstraint]) -> Procedure[None]:
         """Capture as many constraints as requested; one that fails is replaced by another."""
@@ -195,7 +198,8 @@ class Calibration:
                 count = request.constraints - len(captured)
                 missing = Request(request.use, count, request.positions, next_number, captured)
                 key = StepKey("plan", f"{request.use}/{next_number:02d}", None, "replacement")
-                again = yield from task(key, lambda r=missing, k=key: self._plan([r], k.constraint), Plan)  # type: ignore[misc]
+                again = yield from task(key, lambda r=missing, k=key: self._select([r], k.constraint), Plan)  # type: ignore[misc]
+                yield from self._adopt_plan(self._plan.replaced(queue, again))
                 queue = list(again.constraints)
                 next_number += len(queue)
             constraint = queue.pop(0)

@@ -6,10 +6,16 @@ import logging
 import queue
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
 Observer = Callable[[object], None]
+
+_log = logging.getLogger(__name__)
+
+PATIENCE = 2.0
+"""Seconds that the end of a run waits for observers to catch up; then they are left behind."""
 
 _LONGEST_BACKLOG = 1000
 _END = object()
@@ -31,8 +37,9 @@ class Observers:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._events.put(_END)
-        self._thread.join()
+        with suppress(queue.Full):
+            self._events.put(_END, timeout=PATIENCE)
+        self._thread.join(PATIENCE)
 
     def tell(self, event: object) -> None:
         """Never blocks."""

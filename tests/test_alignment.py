@@ -8,18 +8,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dualcal_hal.errors import UsageError
-from dualcal_hal.transforms import rotation_from_vector, transform
+from backends.simulator.rendering import Renderer
+from dualcal_hal.camera import Frame
+from dualcal_hal.errors import ArmMoved, UsageError
+from dualcal_hal.robot import Mode, RobotState
+from dualcal_hal.transforms import inverse, rotation_from_vector, transform
 from procedures.alignment import (
     LONGEST_STEP,
+    Aligner,
     AxisTrack,
+    Outcome,
     Servo,
     largest_alignment_error,
     point_on_axis,
+    target_on_axis,
     tolerance_px,
 )
+from procedures.calibrate import requests_of
+from procedures.detection import Detector
+from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel
+from procedures.planning.poses import PosePlanner
 from procedures.planning.refine import arrival_scatter
+from procedures.planning.ways import WayFinder
+from procedures.steps import ArmReading, Look, Move, Read, Readings, Sighting
 from tests.cells import paper_cell
 
 T_P_E = transform(rotation_from_vector([0.3, -0.5, 0.8]), [0.4, -0.1, 0.6])
@@ -108,6 +120,145 @@ def test_a_jacobian_that_has_become_singular_is_given_up_for_the_first_one():
     servo = Servo(np.eye(2))
     servo.learn(np.array([0.01, 0.0]), np.array([0.0, 0.0]))
     np.testing.assert_allclose(servo.step(np.array([0.01, 0.02])), [-0.01, -0.02])
+
+
+# -- a point ---------------------------------------------------------------------------------------
+
+
+class Cell:
+    """Answers an aligner's steps: arms arrive where they are sent, the camera sees what the truth says."""
+
+    def __init__(self, model, plan, truth):
+        self.model, self.truth = model, truth
+        self.constraint = plan.constraints[0]
+        self.at = {model.active.name: self.constraint.active, model.passive.name: self.constraint.positions[0].passive}
+        self.renderer = Renderer(model.board, 0.01, model.intrinsics, 0.6)
+        self.moves, self.shaken, self.hidden = [], 0, False
+
+    def align(self, tolerance=0.1, belief=None):
+        belief = belief or self.model.nominal
+        ways = WayFinder(self.model, belief, [self.model.home])
+        aligner = Aligner(self.model, belief, ways, Detector(self.model.board, self.model.intrinsics.size), tolerance)
+        camera = self.model.camera_in_passive(self.constraint.active, belief)
+        planned = self.constraint.positions[0]
+        goal = target_on_axis(self.model, AxisTrack(camera, 0.01, 1e-5), planned.passive, planned.distance)
+        procedure = aligner.align(self.constraint.active, planned.passive, goal, camera)
+        try:
+            step = next(procedure)
+            while True:
+                try:
+                    reply = self.answer(step)
+                except ArmMoved as moved:
+                    step = procedure.throw(moved)
+                else:
+                    step = procedure.send(reply)
+        except StopIteration as end:
+            return end.value
+
+    def answer(self, step):
+        match step:
+            case Read():
+                return Readings(*(ArmReading(self.state(q), q) for q in self.at.values()))
+            case Move(arm, goal):
+                self.moves.append(arm)
+                self.at[arm] = goal
+                return self.state(goal)
+            case Look():
+                if self.shaken:
+                    self.shaken -= 1
+                    raise ArmMoved("right", "take a picture", "a joint moved")
+                return Sighting(Frame(self.image(), 0.0, 1), *self.at.values())
+        pytest.fail(f"an unexpected step {step}")
+
+    def state(self, q):
+        return RobotState(q, (0.0,) * 6, Mode.READY, (), 0.0, 1)
+
+    def image(self):
+        q_a, q_p = self.at.values()
+        T_E_T = inverse(self.model.camera_in_passive(q_a, self.truth)) @ self.model.target_in_passive(q_p)
+        grey = np.full((768, 1024), 128.0) if self.hidden else self.renderer.render(T_E_T)
+        return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+def turned(belief, base=(0, 0, 0), camera=(0, 0, 0), shift=(0, 0, 0)):
+    """A belief with its base turned and shifted and its camera turned, by rotation vectors in rad and m."""
+    base_error, camera_error = transform(rotation_from_vector(base), shift), rotation_from_vector(camera)
+    T_H_E = belief.T_H_E @ transform(camera_error, [0, 0, 0])
+    return Belief(belief.T_P_A @ base_error, T_H_E, belief.covariance, "a test")
+
+
+@pytest.fixture(scope="module")
+def plan():
+    cell = paper_cell("procedure.constraints=3", "procedure.verification.constraints=0").cell
+    model = CellModel(cell)
+    ways = WayFinder(model, model.nominal, [model.home])
+    return PosePlanner(model, model.nominal, ways, [1]).plan(requests_of(cell.procedure), model.home, provisional=False)
+
+
+@pytest.fixture
+def model():
+    return CellModel(paper_cell().cell)
+
+
+def test_a_point_that_is_where_it_should_be_needs_one_picture_and_no_move(model, plan):
+    cell = Cell(model, plan, model.nominal)
+    found = cell.align()
+    assert (found.outcome, found.frames, cell.moves) == (Outcome.ALIGNED, 1, [])
+
+
+def test_a_point_off_the_axis_is_brought_onto_it_by_the_passive_arm_alone(model, plan):
+    cell = Cell(model, plan, turned(model.nominal, base=(0.01, -0.02, 0.01), shift=(0.01, 0.0, -0.01)))
+    orientation = model.target_in_passive(cell.at["right"])[:3, :3]
+    found = cell.align()
+    assert found.outcome is Outcome.ALIGNED
+    assert 1 < found.frames <= 4
+    assert set(cell.moves) == {"right"}
+    assert np.max(np.abs(found.offset)) <= 0.1
+    np.testing.assert_allclose(model.target_in_passive(cell.at["right"])[:3, :3], orientation, atol=1e-9)
+
+
+def test_a_target_that_is_not_seen_is_lost(model, plan):
+    cell = Cell(model, plan, model.nominal)
+    cell.hidden = True
+    found = cell.align()
+    assert (found.outcome, found.captured) == (Outcome.LOST, False)
+    assert "not found" in found.reason
+
+
+def test_a_shaken_picture_is_taken_again(model, plan):
+    cell = Cell(model, plan, model.nominal)
+    cell.shaken = 2
+    found = cell.align()
+    assert (found.outcome, found.frames) == (Outcome.ALIGNED, 3)
+
+
+def test_an_arm_that_never_rests_gives_no_capture(model, plan):
+    cell = Cell(model, plan, model.nominal)
+    cell.shaken = 10**6
+    found = cell.align()
+    assert (found.outcome, found.frames, found.captured) == (Outcome.NOT_CONVERGED, 12, False)
+    assert "moved" in found.reason
+
+
+def test_corners_whose_order_is_not_known_are_no_capture(model, plan):
+    cell = Cell(model, plan, turned(model.nominal, camera=(0, 0, np.pi / 4)))
+    found = cell.align()
+    assert found.outcome is Outcome.LOST
+    assert "order" in found.reason
+
+
+def test_a_point_that_stays_within_a_pixel_is_captured_and_marked(model, plan):
+    cell = Cell(model, plan, turned(model.nominal, shift=(0.0, 0.0004, 0.0)))
+    found = cell.align(tolerance=1e-7)
+    assert (found.outcome, found.frames, found.captured) == (Outcome.NOT_CONVERGED, 12, True)
+
+
+def test_a_point_out_of_the_arms_reach_says_so(model, plan):
+    cell = Cell(model, plan, model.nominal)
+    model.passive.upper[:] = np.array(cell.at["right"]) - 0.1
+    found = cell.align()
+    assert found.outcome is Outcome.OUT_OF_REACH
+    assert not found.captured
 
 
 # -- the tolerance ---------------------------------------------------------------------------------

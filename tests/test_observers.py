@@ -31,6 +31,16 @@ def test_a_failing_observer_is_taken_off_and_the_others_go_on(caplog):
 
 
 @pytest.mark.timeout(20)
+def test_an_observer_that_hangs_does_not_keep_a_run_from_ending(monkeypatch):
+    monkeypatch.setattr("procedures.observers.PATIENCE", 0.05)
+    release = threading.Event()
+    with Observers(lambda event: release.wait(15)) as observers:
+        observers.tell("stuck")
+    assert not release.is_set()
+    release.set()
+
+
+@pytest.mark.timeout(20)
 def test_a_slow_observer_never_blocks_the_teller():
     release = threading.Event()
     with Observers(lambda event: release.wait(10)) as observers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -79,6 +80,13 @@ class Plan:
     def of(self, use: Use) -> tuple[PlannedConstraint, ...]:
         """The constraints of one use."""
         return tuple(constraint for constraint in self.constraints if constraint.use == use)
+
+    def replaced(self, dropped: Sequence[PlannedConstraint], by: Plan) -> Plan:
+        """This plan with constraints that will not be visited dropped, and those of another plan in their place."""
+        names = {constraint.name for constraint in dropped}
+        kept = tuple(constraint for constraint in self.constraints if constraint.name not in names)
+        refused = {what: self.refused.get(what, 0) + by.refused.get(what, 0) for what in {**self.refused, **by.refused}}
+        return Plan((*kept, *by.constraints), refused, self.provisional, self.planned_from)
 
     def to_record(self) -> dict[str, Any]:
         """The content of ``plan.json``, from which :meth:`from_record` makes the same plan to the last bit."""

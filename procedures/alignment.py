@@ -7,6 +7,7 @@ moves bring about (Broyden) and kept along the constraint.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -37,6 +38,12 @@ LEAST_CHANGE_PX = 0.5
 AUTO_TOLERANCE = 2.8
 """``auto`` in units of the arrivals' scatter: 99 % of arrivals at the right place are within it in both axes."""
 
+SMALL_CORRECTION_PX = 3.0
+"""After a correction this small (px) what is left of the offset is the arrival's scatter, not the servo's error."""
+
+LEAST_ARRIVALS = 8
+"""Arrivals after small corrections from which on their scatter counts as measured."""
+
 LEAST_AUTO_PX = 0.02
 """px; ``auto`` does not go below what the detection of corners resolves."""
 
@@ -53,7 +60,10 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """What came of one point. ``sighting`` and ``detection`` are of the last picture that showed the target."""
+    """What came of one point. ``sighting`` and ``detection`` are of the last picture that showed the target.
+
+    ``arrivals``: offsets (2,) in px that were left after small corrections.
+    """
 
     outcome: Outcome
     frames: int
@@ -61,6 +71,7 @@ class Alignment:
     reason: str = ""
     sighting: Sighting | None = None
     detection: Detection | None = None
+    arrivals: tuple[Array, ...] = ()
 
     @property
     def captured(self) -> bool:
@@ -71,13 +82,17 @@ class Alignment:
         return self.outcome is Outcome.NOT_CONVERGED and near
 
 
-def tolerance_px(model: CellModel, wanted: float | str) -> float:
-    """The tolerance in px per axis; ``auto`` follows the scatter of arrivals.
+def tolerance_px(model: CellModel, wanted: float | str, arrivals: Sequence[Array] = ()) -> float:
+    """The tolerance in px per axis.
 
-    Raises UsageError for one below twice the scatter, which most arrivals would miss by chance.
+    ``auto`` follows the scatter of arrivals: the one that the stated joint noise implies or, where it is larger, the
+    one of the ``arrivals`` so far (offsets (2,) in px that were left after small corrections). Raises UsageError for a
+    tolerance below twice the implied scatter, which most arrivals would miss by chance.
     """
     scatter = arrival_scatter(model)
     if wanted == "auto":
+        if len(arrivals) >= LEAST_ARRIVALS:
+            scatter = max(scatter, float(np.sqrt(np.mean(np.square(arrivals)))))
         return max(LEAST_AUTO_PX, AUTO_TOLERANCE * scatter)
     tolerance = float(wanted)
     if tolerance < 2 * scatter:
@@ -176,13 +191,14 @@ class Aligner:
         """
         goal, near = T_P_T.copy(), passive
         frames = 0
+        arrivals: tuple[Array, ...] = ()
         last: tuple[Array, Array, Array] | None = None  # shift, lateral and offset of the picture before
         reply = Alignment(Outcome.NOT_CONVERGED, 0, None)
         while frames < MOST_FRAMES:
             joints = self._reach(goal, near)
             blocked = "not reached by the passive arm" if joints is None else (yield from self._go(active, joints))
             if joints is None or blocked:
-                return Alignment(Outcome.OUT_OF_REACH, frames, reply.offset, blocked)
+                return Alignment(Outcome.OUT_OF_REACH, frames, reply.offset, blocked, arrivals=arrivals)
             near = joints
             picture = yield from see(self._model, self._detector, self._belief)
             frames += 1
@@ -191,12 +207,15 @@ class Aligner:
                 reply = replace(reply, frames=frames, reason=picture.reason)
                 continue
             if picture.detection is None:
-                return Alignment(Outcome.LOST, frames, reply.offset, picture.reason)
+                return Alignment(Outcome.LOST, frames, reply.offset, picture.reason, arrivals=arrivals)
             sighting, seen = picture.sighting, picture.detection
             offset = seen.feature - self._model.intrinsics.principal_point
+            if last is not None and np.all(np.abs(last[2]) <= SMALL_CORRECTION_PX):
+                arrivals = (*arrivals, offset)
             if np.all(np.abs(offset) <= self._tolerance):
-                return Alignment(Outcome.ALIGNED, frames, offset, "", sighting, seen)
-            reply = Alignment(Outcome.NOT_CONVERGED, frames, offset, f"{MOST_FRAMES} pictures", sighting, seen)
+                return Alignment(Outcome.ALIGNED, frames, offset, "", sighting, seen, arrivals)
+            reason = f"{MOST_FRAMES} pictures"
+            reply = Alignment(Outcome.NOT_CONVERGED, frames, offset, reason, sighting, seen, arrivals)
             lateral, servo = self._lateral(sighting, seen)
             if last is not None and np.linalg.norm(offset - last[2]) >= LEAST_CHANGE_PX:
                 servo.learn(last[0], lateral - last[1])

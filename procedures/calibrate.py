@@ -70,7 +70,8 @@ class LookRecord:
 class PointRecord:
     """What came of one position: a capture, or the outcome and reason it was given up for.
 
-    ``view`` is what the last picture showed, captured or not; ``servo`` (2, 2) the Jacobian to go on with.
+    ``view`` is what the last picture showed, captured or not; ``servo`` (2, 2) the Jacobian to go on with;
+    ``arrivals_px`` the offsets (2,) that were left after small corrections.
     """
 
     outcome: str
@@ -80,6 +81,7 @@ class PointRecord:
     view: View | None
     capture: CaptureRecord | None
     servo: Array | None
+    arrivals_px: tuple[Array, ...]
 
     def to_record(self) -> dict[str, Any]:
         return {
@@ -90,6 +92,7 @@ class PointRecord:
             "view": _view_record(self.view),
             "capture": None if self.capture is None else self.capture.to_record(),
             "servo": None if self.servo is None else self.servo.tolist(),
+            "arrivals_px": [offset.tolist() for offset in self.arrivals_px],
         }
 
     @classmethod
@@ -103,6 +106,7 @@ class PointRecord:
             _view_from(record["view"]),
             None if capture is None else CaptureRecord.from_record(capture),
             None if servo is None else np.array(servo),
+            tuple(np.array(offset) for offset in record["arrivals_px"]),
         )
 
 
@@ -113,7 +117,8 @@ class Calibration:
         self._procedure = cell.procedure
         self._model = model
         self._detector = Detector(model.board, model.intrinsics.size)
-        self._tolerance = tolerance_px(model, cell.procedure.tolerance_px)
+        self._arrivals_px: list[Array] = []
+        tolerance_px(model, cell.procedure.tolerance_px)
         self._belief = model.nominal
         self._views: list[View] = []
         self._retreats: list[Posture] = [model.home]
@@ -220,7 +225,8 @@ class Calibration:
         model, belief = self._model, self._belief
         T_P_E = model.camera_in_passive(constraint.active, belief)
         track = self._track(constraint, T_P_E)
-        aligner = Aligner(model, belief, self._ways, self._detector, self._tolerance)
+        tolerance = tolerance_px(model, self._procedure.tolerance_px, self._arrivals_px)
+        aligner = Aligner(model, belief, self._ways, self._detector, tolerance)
         arrival = next(self._arrivals)
         for i, planned in enumerate(constraint.positions):
             T_P_T = target_on_axis(model, track, planned.passive, planned.distance)
@@ -232,6 +238,7 @@ class Calibration:
 
             point = yield from task(key, body, PointRecord)
             yield from tell(_point_done(constraint, i, point))
+            self._arrivals_px += point.arrivals_px
             if point.view is not None:
                 self._views.append(point.view)
             if point.capture is None:
@@ -265,7 +272,7 @@ class Calibration:
             yield KeepImage(name, sighting.frame.image)
         offset = None if alignment.offset is None else (float(alignment.offset[0]), float(alignment.offset[1]))
         outcome, frames, reason = str(alignment.outcome), alignment.frames, alignment.reason
-        return PointRecord(outcome, frames, reason, offset, view, capture, aligner.jacobian)
+        return PointRecord(outcome, frames, reason, offset, view, capture, aligner.jacobian, alignment.arrivals)
 
     def _track(self, constraint: PlannedConstraint, T_P_E: Array) -> AxisTrack:
         model = self._model

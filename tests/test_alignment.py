@@ -295,5 +295,22 @@ def test_the_papers_tolerance_is_accepted_and_auto_follows_the_scatter():
     assert tolerance_px(CellModel(paper_cell("robots.right.joint_sigma_mrad=0").cell), "auto") > 0
 
 
+def test_auto_follows_the_scatter_that_is_seen_where_it_is_larger_than_the_one_stated():
+    model = CellModel(paper_cell().cell)
+    stated = tolerance_px(model, "auto")
+    shaky = [np.array([0.2, -0.2]), np.array([-0.2, 0.2])] * 10
+    assert tolerance_px(model, "auto", shaky) == pytest.approx(2.8 * 0.2)
+    assert tolerance_px(model, "auto", shaky[:5]) == stated
+    assert tolerance_px(model, "auto", [np.array([0.001, 0.001])] * 20) == stated
+    assert tolerance_px(model, 0.1, shaky) == 0.1
+
+
+def test_what_is_left_after_small_corrections_counts_as_an_arrivals_scatter(model, plan):
+    near = Cell(model, plan, turned(model.nominal, shift=(0.0, 0.0008, 0.0))).align()
+    assert [tuple(np.round(offset, 1) + 0.0) for offset in near.arrivals] == [(0.0, 0.0)]
+    far = Cell(model, plan, turned(model.nominal, shift=(0.0, 0.02, 0.0))).align()
+    assert len(far.arrivals) == far.frames - 2
+
+
 def test_the_papers_alignment_error_is_its_own():
     assert largest_alignment_error(CellModel(paper_cell().cell), 0.1) == pytest.approx(0.087e-3, abs=0.0005e-3)

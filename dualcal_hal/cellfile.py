@@ -7,6 +7,7 @@ import hashlib
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from io import StringIO
 from itertools import takewhile
@@ -85,6 +86,7 @@ def _checked(document: CommentedMap) -> tuple[CellDocument | None, list[_Finding
 # The file and its line marks
 
 _Position = tuple[int, int]
+_MOST_ENTRIES = 100_000  # far beyond any cell; aliases of aliases can stand for more than a memory holds
 _SET_LAST: _Position = (sys.maxsize, 0)
 
 
@@ -97,12 +99,7 @@ class _Source:
         self._yaml = _round_trip()
         self._yaml.allow_duplicate_keys = True  # key_problems tells of all of them, with their places
         self._root = self._composed()
-        aliases = [
-            self._problem(mark, "an alias is not understood here: write the value out")
-            for mark in _alias_marks(self._root, {id(self._root)})
-        ]
-        if aliases:
-            raise CellFileError([problem for _, problem in aliases])
+        self._check_size(self._root, [])
 
     def _composed(self) -> Node:
         try:
@@ -121,12 +118,24 @@ class _Source:
             raise CellFileError([self._problem(root.start_mark, "must be a mapping of keys to values")[1]])
         return root
 
+    def _check_size(self, node: Node, within: list[Node], size: int = 0) -> int:
+        """Entries of a node with its aliases written out; CellFileError if one contains itself or all are too many."""
+        for _, key, value in _children(node):
+            size += 1
+            if value in (*within, node):
+                raise CellFileError([self._problem(key.start_mark, "the alias stands for what it is part of")[1]])
+            if size > _MOST_ENTRIES:
+                raise CellFileError([self._problem(key.start_mark, f"more than {_MOST_ENTRIES} values")[1]])
+            size = self._check_size(value, [*within, node], size)
+        return size
+
     def document(self) -> CommentedMap:
-        """The document that keeps comments and layout; of a key given twice, the first."""
+        """The document that keeps comments and layout; of a key given twice, the first; aliases are copies."""
         try:
             document: CommentedMap = self._yaml.constructor.construct_document(self._root)
         except ValueError as error:  # an impossible date, say
             raise CellFileError([Problem(self._name, f"is no YAML: {error}")]) from error
+        _write_aliases_out(document, set())
         return document
 
     def key_problems(self) -> list[tuple[_Position, Problem]]:
@@ -191,14 +200,15 @@ def _children(node: Node) -> Iterator[tuple[Any, Node, Node]]:
             yield index, value, value
 
 
-def _alias_marks(node: Node, seen: set[int]) -> Iterator[Any]:
-    # A value in two places could be set in one and change in both; and it may contain itself.
-    for _, key, value in _children(node):
-        if id(value) in seen:
-            yield key.start_mark
-            continue
-        seen.add(id(value))
-        yield from _alias_marks(value, seen)
+def _write_aliases_out(value: CommentedMap | CommentedSeq, seen: set[int]) -> None:
+    """Give every place a value of its own, so that setting one does not change another."""
+    entries = value.items() if isinstance(value, CommentedMap) else enumerate(value)
+    for key, item in list(entries):
+        if isinstance(item, CommentedMap | CommentedSeq):
+            own = deepcopy(item) if id(item) in seen else item
+            value[key] = own
+            seen.add(id(own))
+            _write_aliases_out(own, seen)
 
 
 def _key_problems(node: Node, location: Location) -> Iterator[tuple[Any, str]]:

@@ -425,10 +425,6 @@ BAD = {
         f"procedure.verification.positions: duplicate key, first in line {CELL.count(chr(10))}",
     ),
     "a key that is no text": ("name: small", "name: small\n5: five", "5: five", "a key must be text"),
-    "an alias": (
-        "home_deg: [-5]", "home_deg: &five [-5]\n    link_radius_mm: *five", "link_radius_mm",
-        "an alias is not understood here: write the value out",
-    ),
 }  # fmt: skip
 
 
@@ -519,7 +515,7 @@ def test_a_backend_that_cannot_be_imported_is_a_mistake_of_the_file(
         (b"name: a\n---\nname: b\n", "cell.yaml:2:1: is no YAML: expected a single document"),
         (b"name: \x00", "cell.yaml:1:7: is no YAML: character 0x00 is not allowed"),
         (b"name: a\nx: \xc3\xa4\xff", "cell.yaml:2:5: is not UTF-8: byte 0xff"),
-        (b"name: &a [*a]\n", "cell.yaml:1:7: an alias is not understood here"),
+        (b"name: &a [*a]\n", "cell.yaml:1:7: the alias stands for what it is part of"),
         (b"name: 2020-13-45\n", "cell.yaml: is no YAML: month must be in 1..12"),
     ],
 )
@@ -709,3 +705,32 @@ def test_the_paper_cell_marks_what_was_chosen() -> None:
     for arm in document["robots"].values():
         for key in ("limits_deg", "speed_deg_s", "acceleration_deg_s2", "home_deg", "joint_sigma_mrad"):
             assert "chosen" in arm.ca.items[key][2].value, key
+
+
+# Aliases
+
+
+def test_an_alias_is_the_value_it_stands_for(path: Path) -> None:
+    text = changed(CELL, "speed_deg_s: [120, 90]", "speed_deg_s: &two [120, 90]")
+    text = changed(text, "acceleration_deg_s2: [400, 300]", "acceleration_deg_s2: *two")
+    file = load(path, text)
+    np.testing.assert_allclose(file.cell.active.acceleration, np.radians([120, 90]))
+    assert file.text == text
+
+
+def test_setting_one_of_two_aliased_values_leaves_the_other(path: Path) -> None:
+    text = changed(CELL, "speed_deg_s: [120, 90]", "speed_deg_s: &two [120, 90]")
+    text = changed(text, "acceleration_deg_s2: [400, 300]", "acceleration_deg_s2: *two")
+    file = load(path, text, "robots.left.acceleration_deg_s2.0=500")
+    np.testing.assert_allclose(file.cell.active.speed, np.radians([120, 90]))
+    np.testing.assert_allclose(file.cell.active.acceleration, np.radians([500, 90]))
+    again = load(path, file.text)
+    assert again.cell == file.cell
+
+
+def test_aliases_of_aliases_that_stand_for_more_than_a_memory_holds_are_refused(path: Path) -> None:
+    levels = ["l0: &l0 [0, 0, 0, 0, 0, 0, 0, 0, 0, 0]"]
+    levels += [f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 10)}]" for i in range(1, 10)]
+    path.write_text("\n".join(levels))
+    with pytest.raises(CellFileError, match="more than 100000 values"):
+        load_cell(path)

@@ -14,7 +14,8 @@ from dualcal_hal.cellfile import CellFile
 from dualcal_hal.clock import Clock, RealClock
 from dualcal_hal.config import RobotConfig
 from dualcal_hal.errors import UsageError
-from dualcal_hal.guard import CellGuard, GuardedRobot, JointLimits, Placement
+from dualcal_hal.geometry import CellGeometry
+from dualcal_hal.guard import CellGuard, GuardedRobot, JointLimits
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.registry import backend_class
 from dualcal_hal.robot import Joints
@@ -31,14 +32,14 @@ class Arm:
     chain: Chain
     limits: JointLimits
     home: Joints
+    encoder_sigma: float
 
 
 class Cell:
     """Both arms and the camera, open; a context manager that closes what it opened, in reverse, on any exit."""
 
-    def __init__(self, cell: CellFile, placement: Placement) -> None:
+    def __init__(self, cell: CellFile) -> None:
         self._file = cell
-        self._placement = placement
         self._devices = ExitStack()
         self.clock: Clock
         self.active: Arm
@@ -54,8 +55,8 @@ class Cell:
             self.active = self._arm(config.active_name, config.active, backends)
             self.passive = self._arm(config.passive_name, config.passive, backends)
             self.camera = backends[config.camera.backend].camera(CAMERA_NAME)
-            clearance = config.procedure.clearance
-            self.guard = CellGuard(self.active.robot, self.passive.robot, self._placement, clearance)
+            shapes, T_P_A = CellGeometry.of(config), config.nominal.T_P_A
+            self.guard = CellGuard(self.active.robot, self.passive.robot, shapes, T_P_A, config.procedure.clearance)
             self._devices = opening.pop_all()
         return self
 
@@ -78,7 +79,7 @@ class Cell:
     def _arm(self, name: str, config: RobotConfig, backends: dict[str, Backend]) -> Arm:
         limits = JointLimits(config.lower, config.upper, config.speed, config.acceleration)
         robot = GuardedRobot(backends[config.backend].robot(name), limits, self.clock)
-        return Arm(robot, config.chain, limits, tuple(map(float, config.home)))
+        return Arm(robot, config.chain, limits, tuple(map(float, config.home)), config.encoder_sigma)
 
 
 def _common_clock(backends: dict[str, Backend]) -> Clock:

@@ -9,12 +9,16 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import Array, apply, inverse
+
+if TYPE_CHECKING:
+    from dualcal_hal.config import CellConfig
 
 SHORTEST_LINK = 0.01
 """Offsets below this length (m) are covered by the neighbours' round ends."""
@@ -122,6 +126,23 @@ class CellGeometry:
 
     active: ArmBody
     passive: ArmBody
+
+    @staticmethod
+    def of(cell: CellConfig) -> CellGeometry:
+        """The arms of a cell file with camera and plate.
+
+        The camera's housing stands where the nominal hand-eye transform says: that is known to a centimetre, and what
+        a few pictures say of it is not better at first.
+        """
+        active, passive, board = cell.active, cell.passive, cell.target.board
+        rim = np.sign(board.outline - board.outline.mean(axis=0)) * cell.target.margin
+        body = cell.camera.body_radius, cell.camera.body_length
+        housing = camera_capsule(active.chain.joints, cell.nominal.T_H_E, *body)
+        plate = plate_capsules(passive.chain.joints, passive.target_mount_transform, board.outline + rim)
+        return CellGeometry(
+            ArmBody(active.chain, link_capsules(active.chain, active.link_radius), housing, cell.floor),
+            ArmBody(passive.chain, link_capsules(passive.chain, passive.link_radius), plate, cell.floor),
+        )
 
     def between(self, q_a: ArrayLike, q_p: ArrayLike, T_P_A: Array) -> Array:
         """Least distance (k,) in m between the arms at joint angles (k, n) or (1, n) each."""

@@ -35,14 +35,6 @@ class JointLimits:
     acceleration: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """Where the arms are believed to stand to each other, with their shapes."""
-
-    geometry: CellGeometry
-    T_P_A: Array
-
-
 class CellGuard:
     """Holds both arms; every motion of either passes here.
 
@@ -51,28 +43,29 @@ class CellGuard:
     come closer than half the clearance to the other arm, the floor or the arm itself.
     """
 
-    def __init__(self, active: GuardedRobot, passive: GuardedRobot, placement: Placement, clearance: float) -> None:
+    def __init__(
+        self, active: GuardedRobot, passive: GuardedRobot, geometry: CellGeometry, T_P_A: Array, clearance: float
+    ) -> None:
         self._active, self._passive = active, passive
-        self._placement = placement
+        self._geometry = geometry
+        self._T_P_A = T_P_A
         self._clearance = clearance * PLANNERS_SHARE
         active.admit(self._check_active)
         passive.admit(self._check_passive)
 
-    def place(self, placement: Placement) -> None:
-        """Judge clearance by another belief from here on."""
-        self._placement = placement
+    def place(self, T_P_A: Array) -> None:
+        """Judge clearance with the bases at this ``T_P_A`` (4, 4) from here on; before, it is the nominal one."""
+        self._T_P_A = T_P_A
 
     def _check_active(self, path: Array) -> None:
         other = self._passive.fresh_state("move the other arm")
-        body, geometry = self._placement.geometry.active, self._placement.geometry
-        between = geometry.between(path, [other.positions], self._placement.T_P_A)
-        self._require(self._active.name, np.minimum(body.own_clearance(path), between))
+        between = self._geometry.between(path, [other.positions], self._T_P_A)
+        self._require(self._active.name, np.minimum(self._geometry.active.own_clearance(path), between))
 
     def _check_passive(self, path: Array) -> None:
         other = self._active.fresh_state("move the other arm")
-        body, geometry = self._placement.geometry.passive, self._placement.geometry
-        between = geometry.between([other.positions], path, self._placement.T_P_A)
-        self._require(self._passive.name, np.minimum(body.own_clearance(path), between))
+        between = self._geometry.between([other.positions], path, self._T_P_A)
+        self._require(self._passive.name, np.minimum(self._geometry.passive.own_clearance(path), between))
 
     def _require(self, arm: str, clearance: Array) -> None:
         # An arm that already stands too close may move away, never closer.

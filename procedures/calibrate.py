@@ -305,7 +305,7 @@ class Calibration:
     def _adopt(self, belief: Belief) -> Procedure[None]:
         self._belief = belief
         self._ways = WayFinder(self._model, belief, self._retreats)
-        yield Believe(belief.T_P_A, belief.T_H_E)
+        yield Believe(belief.T_P_A)
 
     def _here(self) -> Procedure[Posture]:
         readings = yield from read()

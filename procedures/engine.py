@@ -10,12 +10,10 @@ import numpy as np
 
 from dualcal_hal.cell import Arm, Cell
 from dualcal_hal.errors import ArmMoved, DualcalError, Interrupted
-from dualcal_hal.guard import READ_TIMEOUT, Placement
+from dualcal_hal.guard import READ_TIMEOUT
 from dualcal_hal.robot import JointPath, Joints, Motion, RobotState
 from dualcal_hal.session.folder import Session
 from procedures.observers import Observers
-from procedures.planning.belief import Belief
-from procedures.planning.model import CellModel
 from procedures.steps import (
     ArmReading,
     Believe,
@@ -41,18 +39,13 @@ LATE_FACTOR, LATE_MARGIN = 2.0, 5.0
 class Engine:
     """Runs a procedure's steps on an open cell, and stops every arm it has moved on any exit."""
 
-    def __init__(self, cell: Cell, model: CellModel, session: Session, observers: Observers) -> None:
+    def __init__(self, cell: Cell, session: Session, observers: Observers) -> None:
         self._cell = cell
-        self._model = model
         self._session = session
         self._observers = observers
         self._wake = threading.Event()
         self._abort_reason: str | None = None
         self._commanded: dict[str, Joints] = {}
-        self._still: dict[str, float] = {
-            arm.robot.name: _reading_noise(sigma)
-            for arm, sigma in ((cell.active, model.active.encoder_sigma), (cell.passive, model.passive.encoder_sigma))
-        }
 
     def run(self, procedure: Procedure[T]) -> T:
         """The procedure's return value; Interrupted after :meth:`abort`; device errors as they are."""
@@ -104,9 +97,8 @@ class Engine:
                 return self._session.write_image(name, image)
             case KeepDocument(file_name, document):
                 return self._session.write_document(file_name, document)
-            case Believe(T_P_A, T_H_E):
-                belief = Belief(T_P_A, T_H_E, np.zeros((12, 12)), "")
-                return self._cell.guard.place(Placement(self._model.geometry(belief), T_P_A))
+            case Believe(T_P_A):
+                return self._cell.guard.place(T_P_A)
         raise TypeError(f"{step!r} is no step")
 
     def _task(self, task: Task) -> Any:
@@ -148,7 +140,7 @@ class Engine:
         joints = []
         for arm, first, last in zip(arms, before, after, strict=True):
             moved = float(np.max(np.abs(np.subtract(last.positions, first.positions))))
-            if moved > self._still[arm.robot.name]:
+            if moved > _reading_noise(arm.encoder_sigma):
                 raise ArmMoved(
                     arm.robot.name,
                     "take a picture",

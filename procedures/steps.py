@@ -73,10 +73,9 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Believe:
-    """From here on the guard judges clearance with these transforms (4, 4)."""
+    """From here on the guard judges clearance with the arms' bases at this ``T_P_A`` (4, 4)."""
 
     T_P_A: Array
-    T_H_E: Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,11 @@ import pytest
 
 from dualcal_hal.cell import Cell
 from dualcal_hal.errors import ArmMoved, CommandRefused, Interrupted, MotionStopped
-from dualcal_hal.guard import Placement
 from dualcal_hal.robot import StopResult
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.journal import StepKey
 from procedures.engine import Engine
 from procedures.observers import Observers
-from procedures.planning.model import CellModel
 from procedures.steps import look, move, read, task, tell
 from tests.cells import small_cell
 
@@ -37,9 +35,7 @@ class Note:
 
 @pytest.fixture
 def cell():
-    file = small_cell()
-    model = CellModel(file.cell)
-    with Cell(file, Placement(model.geometry(model.nominal), model.nominal.T_P_A)) as opened:
+    with Cell(small_cell()) as opened:
         yield opened
 
 
@@ -68,7 +64,7 @@ def engine(cell, tmp_path, events):
     file = small_cell()
     session = Session.create(tmp_path / "session", file.text)
     with Observers(events.append) as observers:
-        yield Engine(cell, CellModel(file.cell), session, observers)
+        yield Engine(cell, session, observers)
 
 
 def nearby(cell, step=0.05):

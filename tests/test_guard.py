@@ -8,7 +8,7 @@ import pytest
 from dualcal_hal.cell import Cell
 from dualcal_hal.clock import VirtualClock
 from dualcal_hal.errors import CommandRefused
-from dualcal_hal.guard import PLANNERS_SHARE, GuardedRobot, JointLimits, Placement
+from dualcal_hal.guard import PLANNERS_SHARE, GuardedRobot, JointLimits
 from dualcal_hal.robot import JointPath, Mode, Motion, Robot, RobotState, StopResult
 from procedures.planning.model import CellModel
 from tests.cells import paper_cell
@@ -138,9 +138,7 @@ def test_the_whole_path_is_judged_from_where_the_arm_stands(device):
 
 @pytest.fixture
 def cell():
-    file = paper_cell()
-    model = CellModel(file.cell)
-    with Cell(file, Placement(model.geometry(model.nominal), model.nominal.T_P_A)) as opened:
+    with Cell(paper_cell()) as opened:
         yield opened
 
 
@@ -162,7 +160,7 @@ def test_where_the_other_arm_stands_follows_from_the_transforms_believed_now(cel
     model = CellModel(paper_cell().cell)
     far = model.nominal.T_P_A.copy()
     far[0, 3] += 1.0
-    cell.guard.place(Placement(model.geometry(model.nominal), far))
+    cell.guard.place(far)
     cell.passive.robot.start(full_speed(cell.passive, REACHING)).wait(20)
 
 
@@ -173,7 +171,7 @@ def test_an_arm_is_not_sent_into_the_floor(cell):
 
 def test_the_guard_insists_on_a_part_of_the_planners_clearance(cell):
     assert 0 < PLANNERS_SHARE < 1
-    geometry = CellModel(paper_cell().cell).geometry(CellModel(paper_cell().cell).nominal)
+    geometry = CellModel(paper_cell().cell).geometry
     cell.active.robot.start(full_speed(cell.active, (0.0, -0.75, 0.2, 0.0, 0.6, 0.0))).wait(20)
     T_P_A = CellModel(paper_cell().cell).nominal.T_P_A
     allowed = refused = None

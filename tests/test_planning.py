@@ -52,7 +52,7 @@ def plan(cell, model, ways, stand_off):
 
 def clear_of_everything(model, path_a, path_p, belief):
     """An independent walk: finer steps than the planner's, one configuration after the other."""
-    geometry = model.geometry(belief)
+    geometry = model.geometry
     return min(
         float(geometry.clearance(a[None], p[None], belief.T_P_A)[0]) for a, p in zip(path_a, path_p, strict=True)
     )
@@ -181,7 +181,7 @@ def test_the_passive_arm_has_room_to_move_each_way_in_the_camera_plane(model, pl
                 flange = goal @ inverse(model.T_F_T)
                 q, reached = arm.chain.inverse(flange, [position.passive], arm.lower, arm.upper)
                 assert reached[0]
-                assert model.geometry(model.nominal).clearance([constraint.active], q, model.nominal.T_P_A)[0] > 0.02
+                assert model.geometry.clearance([constraint.active], q, model.nominal.T_P_A)[0] > 0.02
 
 
 def test_flanges_are_turned_about_two_axes(model, plan):
@@ -239,7 +239,7 @@ def test_orientations_turned_about_one_axis_only_are_not_turned_about_two(angle)
 def test_no_way_leads_through_the_other_arm(model):
     reaching = (0.0, -1.2, 0.8, 0.0, 0.0, 0.0)
     touching = Posture.of(reaching, reaching)
-    geometry = model.geometry(model.nominal)
+    geometry = model.geometry
     assert geometry.between([reaching], [reaching], model.nominal.T_P_A)[0] < 0
     assert WayFinder(model, model.nominal, []).find(model.home, touching) is None
     apart = model.nominal.T_P_A.copy()
@@ -259,7 +259,7 @@ def test_an_arm_at_its_goal_is_not_moved(model, plan):
 
 def test_an_arm_that_stands_too_close_may_leave(model):
     q_a = np.array([0.0, -0.75, 0.2, 0.0, 0.6, 0.0])
-    geometry = model.geometry(model.nominal)
+    geometry = model.geometry
     for bend in np.linspace(0.0, -1.2, 200):
         q_p = np.array([0.0, bend, 0.2, 0.0, 0.6, 0.0])
         clearance = geometry.clearance([q_a], [q_p], model.nominal.T_P_A)[0]

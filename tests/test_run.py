@@ -202,9 +202,8 @@ def test_a_run_begun_anew_on_its_journal_ends_with_the_same_captures(session, tm
     lines = (session / "journal.jsonl").read_bytes().splitlines(keepends=True)
     (folder / "journal.jsonl").write_bytes(b"".join(lines[: 1 + finished]))
     file = load_cell(folder / "cell.yaml")
-    model = CellModel(file.cell)
     resumed = Session(folder)
-    execute(file, model, Calibration(file.cell, model), resumed, lambda event: None)
+    execute(file, Calibration(file.cell, CellModel(file.cell)), resumed, lambda event: None)
     captures = captures_of(resumed.journal, file.sha256, None).captures
     assert captures == read_captures(session / "captures.json").captures
 

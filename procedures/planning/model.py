@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from dualcal_hal.camera import Intrinsics
 from dualcal_hal.config import CellConfig, RobotConfig
-from dualcal_hal.geometry import ArmBody, CellGeometry, camera_capsule, link_capsules, plate_capsules
+from dualcal_hal.geometry import CellGeometry
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.robot import Joints
 from dualcal_hal.target import Checkerboard
@@ -34,7 +34,6 @@ class ArmModel:
     upper: Array
     home: Array
     joint_sigma: float
-    encoder_sigma: float
 
     @staticmethod
     def of(name: str, robot: RobotConfig) -> ArmModel:
@@ -46,7 +45,6 @@ class ArmModel:
             robot.upper - margin,
             robot.home,
             robot.joint_sigma,
-            robot.encoder_sigma,
         )
 
     def nearest_turn(self, q: Array, reference: Array) -> Array:
@@ -83,7 +81,7 @@ class CellModel:
         self.tilt_max: float = cell.procedure.tilt_max
         self.margin: float = cell.procedure.clearance
         self.nominal = Belief.nominal(cell.nominal)
-        self._cell = cell
+        self.geometry = CellGeometry.of(cell)
         # The plate may not leave the image either: its margin helps nobody but the eye that looks for the corners.
         self._in_view = np.concatenate([self.board.corners, self.board.outline])
 
@@ -93,18 +91,6 @@ class CellModel:
 
     def arm(self, name: str) -> ArmModel:
         return {self.active.name: self.active, self.passive.name: self.passive}[name]
-
-    def geometry(self, belief: Belief) -> CellGeometry:
-        """The arms' shapes, the camera where it is believed to sit."""
-        cell = self._cell
-        board, camera = cell.target, cell.camera
-        margin = np.sign(self.board.outline - self.board.outline.mean(axis=0)) * board.margin
-        housing = camera_capsule(self.active.chain.joints, belief.T_H_E, camera.body_radius, camera.body_length)
-        plate = plate_capsules(self.passive.chain.joints, self.T_F_T, self.board.outline + margin)
-        return CellGeometry(
-            ArmBody(self.active.chain, link_capsules(self.active.chain, cell.active.link_radius), housing, cell.floor),
-            ArmBody(self.passive.chain, link_capsules(self.passive.chain, cell.passive.link_radius), plate, cell.floor),
-        )
 
     def camera_in_passive(self, q_a: ArrayLike, belief: Belief) -> Array:
         """``T_P_E`` (..., 4, 4) at the active arm's joint angles (..., n)."""

@@ -29,7 +29,7 @@ class WayFinder:
     def __init__(self, model: CellModel, belief: Belief, retreats: Iterable[Posture]) -> None:
         self._model = model
         self._T_P_A: Array = belief.T_P_A
-        self.geometry: CellGeometry = model.geometry(belief)
+        self.geometry: CellGeometry = model.geometry
         self._retreats = tuple(retreats)
 
     def find(self, start: Posture, goal: Posture) -> tuple[Leg, ...] | None:

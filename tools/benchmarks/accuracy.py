@@ -37,7 +37,6 @@ class Run:
 def run(path: Path, seed: int, overrides: list[str]) -> Run:
     """A whole run with both seeds set, in a folder that is thrown away."""
     file = load_cell(path, [*overrides, f"procedure.seed={seed}", f"simulation.seed={seed}"])
-    model = CellModel(file.cell)
     points: list[PointDone] = []
 
     def collect(event: object) -> None:
@@ -46,7 +45,7 @@ def run(path: Path, seed: int, overrides: list[str]) -> Run:
 
     with tempfile.TemporaryDirectory() as folder:
         session = Session.create(Path(folder) / "session", file.text)
-        execute(file, model, Calibration(file.cell, model), session, collect)
+        execute(file, Calibration(file.cell, CellModel(file.cell)), session, collect)
         result = conclude(file, session, captures_of(session.journal, file.sha256, None))
     assert result.truth_error is not None
     assert result.mismatch_after is not None

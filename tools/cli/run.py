@@ -12,7 +12,6 @@ from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.clock import utc_now
 from dualcal_hal.errors import UsageError
-from dualcal_hal.guard import Placement
 from dualcal_hal.registry import backend_class
 from dualcal_hal.session.captures import Captures, write_captures
 from dualcal_hal.session.folder import Session
@@ -63,7 +62,7 @@ def run_cell(options: RunOptions) -> int:
     session = Session.create(folder, file.text)
     try:
         with progress(console) as watcher:
-            execute(file, model, calibration, session, watcher)
+            execute(file, calibration, session, watcher)
     finally:
         captures = captures_of(session.journal, file.sha256, started.isoformat(timespec="seconds"))
         write_captures(session.captures_path, captures)
@@ -84,12 +83,11 @@ def _load(options: RunOptions) -> CellFile:
     return load_cell(options.cell, overrides)
 
 
-def execute(file: CellFile, model: CellModel, calibration: Calibration, session: Session, watcher: Observer) -> None:
+def execute(file: CellFile, calibration: Calibration, session: Session, watcher: Observer) -> None:
     """Run the procedure on the cell's devices, which are closed again on any exit."""
-    placement = Placement(model.geometry(model.nominal), model.nominal.T_P_A)
     try:
-        with Observers(watcher) as observers, Cell(file, placement) as cell:
-            engine = Engine(cell, model, session, observers)
+        with Observers(watcher) as observers, Cell(file) as cell:
+            engine = Engine(cell, session, observers)
             with aborting_with(engine.abort):
                 engine.run(calibration.steps())
     except Exception as error:

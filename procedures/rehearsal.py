@@ -34,7 +34,10 @@ class Rehearsal:
 
 
 def rehearse(cell: CellConfig, model: CellModel) -> Rehearsal:
-    """From ``home``, with the nominal transforms. Raises NoPlan if there is no stand-off or no posture for a look."""
+    """From ``home``, with the nominal transforms.
+
+    Raises NoPlan if there is no stand-off or no posture for a look, and where a cell that takes no looks has no plan.
+    """
     belief, start = model.nominal, model.home
     ways = WayFinder(model, belief, [model.home])
     stand_off: StandOff | None = None
@@ -49,6 +52,8 @@ def rehearse(cell: CellConfig, model: CellModel) -> Rehearsal:
             requests_of(cell.procedure), start, provisional=True
         )
     except NoPlan as refusal:
+        if stand_off is None:
+            raise
         return Rehearsal(stand_off, looks, None, str(refusal))
     return Rehearsal(stand_off, looks, plan, "")
 

@@ -8,7 +8,7 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from procedures.events import LookTaken, PlanReady, PointDone
+from procedures.events import BeliefRefined, LookTaken, PlanReady, PointDone
 
 
 class Lines:
@@ -64,6 +64,8 @@ class Bars:
                 where = f"{event.constraint} position {event.position + 1}/{event.positions}"
                 text = f"{where}: {event.outcome}, {event.frames} pictures{offset}"
                 self._advance(event.use, 0, text, by=1 if event.captured else 0)
+            case BeliefRefined():
+                pass  # on a terminal the bars say enough
             case _:
                 self._bars.console.print(str(event), markup=False, highlight=False)
 

@@ -24,7 +24,7 @@ class Backend(ABC):
     """
 
     time: ClassVar[Literal["drives", "real"]]
-    simulated: ClassVar[bool]
+    simulated: bool
     Options: ClassVar[type[BaseModel]]
 
     def __init__(self, name: str, cell: CellFile) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
@@ -21,6 +20,8 @@ from dualcal_hal.registry import backend_class
 from dualcal_hal.robot import Joints
 
 OPEN_TIMEOUT = 10.0
+"""Seconds that a backend may take to open."""
+
 CAMERA_NAME = "camera"
 
 
@@ -39,9 +40,14 @@ class Cell:
     """Both arms and the camera, open; a context manager that closes what it opened, in reverse, on any exit."""
 
     def __init__(self, cell: CellFile) -> None:
+        """Refuses what the backends cannot serve; opens nothing yet."""
         self._file = cell
+        config = cell.cell
+        used = {config.active.backend, config.passive.backend, config.camera.backend}
+        types = {name: config.backends[name].type for name in config.backends if name in used}
+        self._backends = {name: backend_class(type_)(name, cell) for name, type_ in types.items()}
+        self.clock = _common_clock(self._backends)
         self._devices = ExitStack()
-        self.clock: Clock
         self.active: Arm
         self.passive: Arm
         self.camera: Camera
@@ -49,12 +55,13 @@ class Cell:
 
     def __enter__(self) -> Self:
         with ExitStack() as opening:
-            backends = {name: self._opened(name, opening) for name in self._file.cell.backends}
-            self.clock = _common_clock(backends)
+            for backend in self._backends.values():
+                opening.callback(backend.close)
+                backend.open(OPEN_TIMEOUT)
             config = self._file.cell
-            self.active = self._arm(config.active_name, config.active, backends)
-            self.passive = self._arm(config.passive_name, config.passive, backends)
-            self.camera = backends[config.camera.backend].camera(CAMERA_NAME)
+            self.active = self._arm(config.active_name, config.active)
+            self.passive = self._arm(config.passive_name, config.passive)
+            self.camera = self._backends[config.camera.backend].camera(CAMERA_NAME)
             shapes, T_P_A = CellGeometry.of(config), config.nominal.T_P_A
             self.guard = CellGuard(self.active.robot, self.passive.robot, shapes, T_P_A, config.procedure.clearance)
             self._devices = opening.pop_all()
@@ -69,16 +76,14 @@ class Cell:
         """The arm of that name in the cell file."""
         return {self.active.robot.name: self.active, self.passive.robot.name: self.passive}[name]
 
-    def _opened(self, name: str, opening: ExitStack) -> Backend:
-        backend = backend_class(self._file.cell.backends[name].type)(name, self._file)
-        close: Callable[[], None] = backend.close
-        opening.callback(close)
-        backend.open(OPEN_TIMEOUT)
-        return backend
+    @property
+    def simulated(self) -> bool:
+        """Whether no real device stands behind any backend."""
+        return all(backend.simulated for backend in self._backends.values())
 
-    def _arm(self, name: str, config: RobotConfig, backends: dict[str, Backend]) -> Arm:
+    def _arm(self, name: str, config: RobotConfig) -> Arm:
         limits = JointLimits(config.lower, config.upper, config.speed, config.acceleration)
-        robot = GuardedRobot(backends[config.backend].robot(name), limits, self.clock)
+        robot = GuardedRobot(self._backends[config.backend].robot(name), limits, self.clock)
         return Arm(robot, config.chain, limits, tuple(map(float, config.home)), config.encoder_sigma)
 
 

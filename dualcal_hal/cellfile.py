@@ -47,6 +47,13 @@ def load_cell(path: Path, overrides: Sequence[str] = ()) -> CellFile:
     with all problems found, each at ``FILE:LINE:COLUMN`` or ``--set PATH``.
     """
     text = _read(path)
+    try:
+        return _load(path, text, overrides)
+    except RecursionError as error:
+        raise CellFileError([Problem(str(path), "values are nested too deeply, in the file or with --set")]) from error
+
+
+def _load(path: Path, text: str, overrides: Sequence[str]) -> CellFile:
     source = _Source(str(path), text)
     document = source.document()
     _, as_written = _checked(document)

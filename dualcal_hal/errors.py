@@ -15,7 +15,8 @@
         ├── CommandRefused (ValueError)     by the guard or the device, before anything moved
         ├── MotionStopped (RuntimeError)
         ├── MotionFailed (RuntimeError)
-        └── ArmMoved (RuntimeError)
+        ├── ArmMoved (RuntimeError)
+        └── StopFailed (RuntimeError)
 
 Leaves also inherit the fitting builtin. No third party's exception crosses a backend's border.
 """
@@ -112,3 +113,7 @@ class MotionFailed(DeviceError, RuntimeError):
 
 class ArmMoved(DeviceError, RuntimeError):
     """An arm moved while a picture was taken; the capture is refused."""
+
+
+class StopFailed(DeviceError, RuntimeError):
+    """An arm was told to stop and did not confirm that it stands."""

@@ -10,7 +10,7 @@ import numpy as np
 from dualcal_hal.clock import Clock
 from dualcal_hal.errors import CommandRefused
 from dualcal_hal.geometry import CellGeometry, interpolate
-from dualcal_hal.robot import JointPath, Mode, Motion, Robot, RobotState, StopResult
+from dualcal_hal.robot import JointPath, Mode, Motion, MotionState, Robot, RobotState, StopResult
 from dualcal_hal.transforms import Array
 
 READ_TIMEOUT = 0.5
@@ -18,6 +18,9 @@ READ_TIMEOUT = 0.5
 
 OLDEST_FEEDBACK = 0.1
 """Seconds after which a state no longer says where an arm is."""
+
+STANDSTILL = 0.01
+"""rad/s below which a joint counts as standing; readings of a resting arm scatter."""
 
 PLANNERS_SHARE = 0.5
 """Part of the clearance that the guard insists on; the rest is what plans and the reading of joints may differ by."""
@@ -39,8 +42,8 @@ class CellGuard:
     """Holds both arms; every motion of either passes here.
 
     Refused with CommandRefused before the first byte: values that are not finite or too many or few, positions
-    beyond limits, speeds beyond the arm's, an arm that is not ready or whose state is not fresh, and paths that
-    come closer than half the clearance to the other arm, the floor or the arm itself.
+    beyond limits, speeds beyond the arm's, an arm that is not ready or whose state is not fresh, the second of two
+    arms at a time, and paths that come closer than half the clearance to the other arm, the floor or the arm itself.
     """
 
     def __init__(
@@ -58,27 +61,40 @@ class CellGuard:
         self._T_P_A = T_P_A
 
     def _check_active(self, path: Array) -> None:
-        other = self._passive.fresh_state("move the other arm")
-        between = self._geometry.between(path, [other.positions], self._T_P_A)
-        self._require(self._active.name, np.minimum(self._geometry.active.own_clearance(path), between))
+        other = self._standing(self._passive)
+        self._require(
+            self._active.name,
+            self._geometry.between(path, [other.positions], self._T_P_A),
+            self._geometry.active.own_clearance(path),
+        )
 
     def _check_passive(self, path: Array) -> None:
-        other = self._active.fresh_state("move the other arm")
-        between = self._geometry.between([other.positions], path, self._T_P_A)
-        self._require(self._passive.name, np.minimum(self._geometry.passive.own_clearance(path), between))
+        other = self._standing(self._active)
+        self._require(
+            self._passive.name,
+            self._geometry.between([other.positions], path, self._T_P_A),
+            self._geometry.passive.own_clearance(path),
+        )
 
-    def _require(self, arm: str, clearance: Array) -> None:
-        # An arm that already stands too close may move away, never closer.
-        allowed = min(self._clearance, float(clearance[0]) - 1e-9)
-        least = float(np.min(clearance))
-        if least < allowed:
-            raise CommandRefused(
-                arm,
-                "move",
-                f"the path comes within {least * 1e3:.1f} mm of the other arm, the floor or itself, "
-                f"{allowed * 1e3:.1f} mm are the least",
-                "nothing was sent; plan anew or check the nominal transforms in the cell file",
-            )
+    def _standing(self, other: GuardedRobot) -> RobotState:
+        """Where the other arm stands; one that moves is nowhere for long enough to keep clear of."""
+        state = other.fresh_state("move the other arm")
+        if other.moving or max(map(abs, state.velocities)) > STANDSTILL:
+            raise CommandRefused(other.name, "move the other arm", "this one is moving", "wait until it has settled")
+        return state
+
+    def _require(self, arm: str, between: Array, own: Array) -> None:
+        for clearance, what in ((between, "the other arm"), (own, "the floor or itself")):
+            # An arm that already stands too close to something may move away from that, never closer.
+            allowed = min(self._clearance, float(clearance[0]) - 1e-9)
+            least = float(np.min(clearance))
+            if not least >= allowed:
+                raise CommandRefused(
+                    arm,
+                    "move",
+                    f"the path comes within {least * 1e3:.1f} mm of {what}, {allowed * 1e3:.1f} mm are the least",
+                    "nothing was sent; plan anew or check the nominal transforms in the cell file",
+                )
 
 
 class GuardedRobot(Robot):
@@ -90,6 +106,12 @@ class GuardedRobot(Robot):
         self._limits = limits
         self._clock = clock
         self._check_cell: Callable[[Array], None] | None = None
+        self._motion: Motion | None = None
+
+    @property
+    def moving(self) -> bool:
+        """Whether the motion that was started last has not ended."""
+        return self._motion is not None and self._motion.state is MotionState.RUNNING
 
     def admit(self, check: Callable[[Array], None]) -> None:
         """Let ``check`` judge each sampled path (k, n); without it nothing moves (called by CellGuard)."""
@@ -114,7 +136,8 @@ class GuardedRobot(Robot):
             what = ", ".join([f"mode '{state.mode}'", *state.faults])
             raise CommandRefused(self.name, "move", f"the arm is not ready: {what}", "clear it at the controller")
         self._check_cell(interpolate([state.positions, *path.waypoints]))
-        return self._robot.start(path)
+        self._motion = self._robot.start(path)
+        return self._motion
 
     def stop(self, reason: str) -> StopResult:
         return self._robot.stop(reason)
@@ -129,11 +152,15 @@ class GuardedRobot(Robot):
         self._robot.reset_fault(timeout)
 
     def fresh_state(self, attempted: str) -> RobotState:
-        """The arm's state, read now; CommandRefused if it is older than it may be."""
+        """The arm's state, read now; CommandRefused if it is not fresh or no joint angles."""
         state = self._robot.read(READ_TIMEOUT)
         age = self._clock.now() - state.time
-        if age > OLDEST_FEEDBACK:
+        if not 0.0 <= age <= OLDEST_FEEDBACK:
             raise CommandRefused(self.name, attempted, f"its state is {age:.2f} s old", "check the link to the arm")
+        for what, values in (("positions", state.positions), ("velocities", state.velocities)):
+            if len(values) != len(self._limits.lower) or not np.all(np.isfinite(values)):
+                why = f"its {what} are not {len(self._limits.lower)} finite numbers: {values}"
+                raise CommandRefused(self.name, attempted, why, "check the link and the encoders")
         return state
 
     def _check_values(self, path: JointPath) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 
 from dualcal_hal.config import METHODS, CellConfig
 from dualcal_hal.errors import DegenerateCaptures, UsageError
-from dualcal_hal.session.captures import CaptureRecord, Captures
+from dualcal_hal.robot import Joints
+from dualcal_hal.session.captures import CaptureRecord, Captures, Use
 from dualcal_hal.session.result import Mismatch, Rejected, Result, Unobservable
 from dualcal_hal.transforms import Array
 from procedures.estimation import Degenerate, Estimate, Iteration, Statistics, estimate, judge, mismatch, statistics
@@ -17,13 +18,16 @@ from procedures.estimation import Degenerate, Estimate, Iteration, Statistics, e
 FARTHEST_ALIGNED = 1.0
 """px in each axis; a feature point farther from the principal point than this does not count as aligned."""
 
+FARTHEST_ARRIVED = 5e-3
+"""rad; an active joint farther than this from where the constraint's others have it stands on another axis."""
+
 
 def analyse(captures: Captures, cell: CellConfig, method: str) -> Result:
     """Estimate from the calibration captures, verify on the others.
 
-    A verification capture on a constraint or arrival that was calibrated with is rejected, and so is a capture whose
-    feature point is not aligned. Raises UsageError for an unknown method and DegenerateCaptures for captures
-    that do not determine the transforms.
+    Rejected is a verification capture on a constraint or arrival that was calibrated with, a capture whose feature
+    point is not aligned, and one for which the active arm stood elsewhere than for its constraint's others. Raises
+    UsageError for an unknown method and DegenerateCaptures for captures that do not determine the transforms.
     """
     if method not in METHODS:
         raise UsageError(f"unknown method '{method}'; there are: {', '.join(METHODS)}")
@@ -54,15 +58,28 @@ def analyse(captures: Captures, cell: CellConfig, method: str) -> Result:
     )
 
 
+def _active_joints(captures: Sequence[CaptureRecord]) -> dict[tuple[Use, str], Array]:
+    """Where the active arm stood for most captures of each constraint, (n,) rad: the median of each joint."""
+    joints: dict[tuple[Use, str], list[Joints]] = {}
+    for capture in captures:
+        joints.setdefault((capture.use, capture.constraint), []).append(capture.active_joints)
+    return {constraint: np.median(angles, axis=0) for constraint, angles in joints.items()}
+
+
 def _sort_out(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[list[CaptureRecord], tuple[Rejected, ...]]:
     calibrated = [capture for capture in captures if capture.use == "calibration"]
     constraints = {capture.constraint for capture in calibrated}
     arrivals = {capture.active_arrival for capture in calibrated}
+    stands = _active_joints(captures)
     used, rejected = [], []
     for capture in captures:
+        moved = float(np.max(np.abs(np.array(capture.active_joints) - stands[capture.use, capture.constraint])))
         offset = np.abs(np.array(capture.feature) - cell.camera.intrinsics.principal_point)
         if np.any(offset > FARTHEST_ALIGNED):
             reason = f"not aligned: the feature point is {offset[0]:.2f} and {offset[1]:.2f} px off the optical axis"
+        elif moved > FARTHEST_ARRIVED:
+            degrees = np.rad2deg(moved)
+            reason = f"the active arm stands {degrees:.2f} deg from where the others of {capture.constraint} have it"
         elif capture.use == "verification" and (
             capture.constraint in constraints or capture.active_arrival in arrivals
         ):

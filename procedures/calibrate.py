@@ -7,7 +7,8 @@ improves; estimation and verification work on the captures alone and start from 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -17,6 +18,7 @@ from dualcal_hal.errors import NoPlan
 from dualcal_hal.robot import Joints
 from dualcal_hal.session.captures import CaptureRecord, Captures
 from dualcal_hal.session.journal import Journal, StepKey
+from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Rejected
 from dualcal_hal.transforms import Array
 from procedures.alignment import Aligner, Alignment, AxisTrack, Outcome, point_on_axis, target_on_axis, tolerance_px
 from procedures.detection import Detector
@@ -191,7 +193,8 @@ class Calibration:
 
     def _adopt_plan(self, plan: Plan) -> Procedure[None]:
         self._plan = plan
-        yield KeepDocument("plan.json", plan.to_record())
+        believed = {T_P_A_NAME: self._belief.T_P_A.tolist(), T_H_E_NAME: self._belief.T_H_E.tolist()}
+        yield KeepDocument("plan.json", {**plan.to_record(), "transforms": believed})
         yield from tell(PlanReady(plan))
 
     def _constraints(self, request: Request, queue: list[PlannedConstraint]) -> Procedure[None]:
@@ -342,6 +345,21 @@ def captures_of(journal: Journal, cell_sha256: str, started: str | None) -> Capt
     given_up = {key.constraint for key, point in points if point.capture is None}
     captures = [point.capture for key, point in points if point.capture and key.constraint not in given_up]
     return Captures(cell_sha256, started, tuple(captures))
+
+
+def finished(captures: Captures, procedure: ProcedureConfig) -> tuple[Captures, tuple[Rejected, ...]]:
+    """A session's captures without those of a constraint that was interrupted, and these with the reason."""
+    wanted = {request.use: request.positions for request in requests_of(procedure)}
+    taken = Counter((capture.use, capture.constraint) for capture in captures.captures)
+    kept, left_out = [], []
+    for capture in captures.captures:
+        have, want = taken[capture.use, capture.constraint], wanted.get(capture.use, 0)
+        if have >= want:
+            kept.append(capture)
+        else:
+            reason = f"{capture.constraint} is not finished: {have} of {want} positions"
+            left_out.append(Rejected(capture.id, reason))
+    return replace(captures, captures=tuple(kept)), tuple(left_out)
 
 
 def _point_done(constraint: PlannedConstraint, position: int, point: PointRecord) -> PointDone:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dualcal_hal.cell import Arm, Cell
-from dualcal_hal.errors import ArmMoved, DualcalError, Interrupted
+from dualcal_hal.errors import ArmMoved, DualcalError, Interrupted, StopFailed
 from dualcal_hal.guard import READ_TIMEOUT
 from dualcal_hal.robot import JointPath, Joints, Motion, RobotState
 from dualcal_hal.session.folder import Session
@@ -49,17 +49,16 @@ class Engine:
 
     def run(self, procedure: Procedure[T]) -> T:
         """The procedure's return value; Interrupted after :meth:`abort`; device errors as they are."""
-        cause = "the run has ended"
         try:
-            return self._drive(procedure)
+            result = self._drive(procedure)
         except BaseException as error:
-            cause = str(error) or type(error).__name__
+            self._stop_after(error)
             raise
-        finally:
-            self._stop_all(cause)
+        self._stop_all("the run has ended")
+        return result
 
     def abort(self, reason: str) -> None:
-        """End the run at once: from any thread or a signal's handler, any number of times."""
+        """End the run at once: from any thread, any number of times; not from a signal's handler."""
         self._abort_reason = reason
         self._wake.set()
 
@@ -68,16 +67,17 @@ class Engine:
         error: DualcalError | None = None
         try:
             while True:
-                step = procedure.send(reply) if error is None else procedure.throw(error)
+                try:
+                    step = procedure.send(reply) if error is None else procedure.throw(error)
+                except StopIteration as end:
+                    result: T = end.value
+                    return result
                 reply, error = None, None
                 try:
                     self._raise_if_aborted()
                     reply = self._execute(step)
                 except DualcalError as caught:
                     error = caught
-        except StopIteration as end:
-            result: T = end.value
-            return result
         finally:
             procedure.close()
 
@@ -144,8 +144,9 @@ class Engine:
                 raise ArmMoved(
                     arm.robot.name,
                     "take a picture",
-                    f"a joint moved by {np.rad2deg(moved):.4f} deg during the exposure",
-                    "check what moves or shakes the arm",
+                    f"a joint moved by {np.rad2deg(moved):.4f} deg during the exposure, more than the "
+                    f"{np.rad2deg(_reading_noise(arm.encoder_sigma)):.4f} deg that encoder_sigma_mrad explains",
+                    "check what moves or shakes the arm, or what its encoders scatter by",
                 )
             joints.append(tuple(map(float, np.mean([first.positions, last.positions], axis=0))))
         return Sighting(frame, *joints)
@@ -154,30 +155,32 @@ class Engine:
         if self._abort_reason is not None:
             raise Interrupted(self._abort_reason)
 
+    def _stop_after(self, error: BaseException) -> None:
+        """Stop the arms because of an error, and let the error say what became of it."""
+        try:
+            self._stop_all(str(error) or type(error).__name__)
+        except StopFailed as failure:
+            error.add_note(str(failure))
+            return
+        if self._commanded:
+            error.add_note(f"stopped: {', '.join(sorted(self._commanded))}")
+        else:
+            error.add_note("no arm was moved")
+
     def _stop_all(self, cause: str) -> None:
-        """Stop every arm that was moved, each whatever the others' stops do."""
-        errors: list[Exception] = []
+        """Stop every arm that was moved, each whatever the others' stops do; StopFailed names those that may move."""
+        failures: dict[str, str] = {}
         for name in self._commanded:
             try:
                 result = self._cell.arm(name).robot.stop(cause)
-            except Exception as error:  # noqa: BLE001 - the other arm must still be stopped
-                errors.append(error)
+            except Exception as error:  # noqa: BLE001 - the other arm must still be stopped; told by StopFailed
+                failures[name] = f"{type(error).__name__}: {error}"
                 continue
             if not result.confirmed:
-                self._observers.tell(StopUnconfirmed(name, result.detail))
-        if errors:
-            raise ExceptionGroup("arms that could not be stopped", errors)
-
-
-class StopUnconfirmed:
-    """An arm did not confirm that it stands still."""
-
-    def __init__(self, arm: str, detail: str) -> None:
-        self.arm = arm
-        self.detail = detail
-
-    def __str__(self) -> str:
-        return f"{self.arm}: the stop is not confirmed: {self.detail}; use the emergency stop if it moves"
+                failures[name] = f"not confirmed: {result.detail}"
+        if failures:
+            arms, reasons = ", ".join(failures), "; ".join(f"{name}: {why}" for name, why in failures.items())
+            raise StopFailed(arms, "stop", reasons, "it may still move: use the emergency stop")
 
 
 def _reading_noise(encoder_sigma: float) -> float:

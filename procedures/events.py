@@ -9,6 +9,11 @@ import numpy as np
 from procedures.planning.plan import Plan
 
 
+def counted(count: int, thing: str) -> str:
+    """``1 picture``, ``2 pictures``."""
+    return f"{count} {thing}" + ("" if count == 1 else "s")
+
+
 @dataclass(frozen=True)
 class LookTaken:
     """One of the first looks; ``reason`` says why it found nothing."""
@@ -51,7 +56,7 @@ class PointDone:
         offset = f", offset {np.max(np.abs(self.offset_px)):.3f} px" if self.offset_px is not None else ""
         reason = f" ({self.reason})" if self.reason else ""
         where = f"{self.constraint} position {self.position + 1}/{self.positions}"
-        return f"{where}: {self.outcome} after {self.frames} pictures{offset}{reason}"
+        return f"{where}: {self.outcome} after {counted(self.frames, 'picture')}{offset}{reason}"
 
 
 @dataclass(frozen=True)
@@ -86,4 +91,4 @@ class BeliefRefined:
     rms_px: float
 
     def __str__(self) -> str:
-        return f"transforms for planning from {self.views} views, {self.rms_px:.3f} px rms"
+        return f"transforms for planning from {counted(self.views, 'view')}, {self.rms_px:.3f} px rms"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import threading
+import re
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from dualcal_hal.cell import Cell
-from dualcal_hal.errors import ArmMoved, CommandRefused, Interrupted, MotionStopped
+from dualcal_hal.errors import ArmMoved, CommandRefused, Interrupted, LinkLost, MotionStopped, StopFailed
 from dualcal_hal.robot import StopResult
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.journal import StepKey
@@ -129,24 +129,67 @@ def test_an_arm_that_cannot_be_stopped_does_not_keep_the_other_from_it(engine, c
         yield from move("left", nearby(cell))
         yield from move("right", nearby(cell))
 
-    with pytest.raises(ExceptionGroup, match="could not be stopped") as failure:
+    with pytest.raises(StopFailed, match=r"left: stop: left: OSError: cable cut; it may still move"):
         engine.run(procedure())
-    assert "cable cut" in str(failure.value.exceptions[0])
     assert [name for name, _ in stops] == ["right"]
 
 
-def test_an_unconfirmed_stop_is_told(engine, cell, events, monkeypatch):
+def test_a_stop_that_is_not_confirmed_is_no_good_end(engine, cell, monkeypatch):
     monkeypatch.setattr(cell.active.robot, "stop", lambda reason: StopResult(False, "no newer state"))
 
     def procedure():
         yield from move("left", nearby(cell))
-        return (yield from tell("moved"))
 
-    engine.run(procedure())
-    engine._observers.tell("end")
-    while "end" not in events:
-        threading.Event().wait(0.01)
-    assert any("not confirmed" in str(event) for event in events)
+    with pytest.raises(StopFailed, match=r"not confirmed: no newer state.*emergency stop"):
+        engine.run(procedure())
+
+
+@pytest.mark.parametrize(
+    ("moved", "confirmed", "note"),
+    [((), True, "no arm was moved"), (("left",), True, "stopped: left"), (("left",), False, "left: stop: .*emergency")],
+)
+def test_an_error_says_what_became_of_the_arms(engine, cell, monkeypatch, moved, confirmed, note):
+    monkeypatch.setattr(cell.active.robot, "stop", lambda reason: StopResult(confirmed, "as told"))
+
+    def procedure():
+        for arm in moved:
+            yield from move(arm, nearby(cell))
+        raise LinkLost("right", "read", "no answer")
+
+    with pytest.raises(LinkLost) as failure:
+        engine.run(procedure())
+    assert re.match(note, failure.value.__notes__[0])
+
+
+def test_a_device_that_raises_stop_iteration_does_not_end_the_procedure_as_if_it_were_done(engine, cell, monkeypatch):
+    def exhausted(not_before, timeout):
+        raise StopIteration
+
+    monkeypatch.setattr(cell.camera, "grab", exhausted)
+
+    def procedure():
+        yield from look()
+
+    with pytest.raises(StopIteration):
+        engine.run(procedure())
+
+
+def test_a_sightings_joints_are_the_mean_of_both_readings(engine, cell, monkeypatch):
+    states = []
+    read_robot = cell.active.robot.read
+
+    def recording(timeout):
+        states.append(read_robot(timeout))
+        return states[-1]
+
+    monkeypatch.setattr(cell.active.robot, "read", recording)
+
+    def procedure():
+        return (yield from look())
+
+    sighting = engine.run(procedure())
+    assert states[0].positions != states[1].positions
+    assert sighting.active == tuple(np.mean([states[0].positions, states[1].positions], axis=0))
 
 
 def test_an_abort_before_a_step_ends_the_run_and_touches_nothing(engine, stops):

@@ -119,6 +119,22 @@ def test_an_arm_whose_state_is_old_is_not_moved(device, guarded):
     assert device.sent == []
 
 
+def test_an_arm_whose_state_is_from_the_future_or_of_no_time_is_not_moved(device, guarded):
+    for age in (-1.0, float("nan")):
+        device.age = age
+        with pytest.raises(CommandRefused, match="s old"):
+            guarded.start(path((0.1, 0.1)))
+    assert device.sent == []
+
+
+@pytest.mark.parametrize("positions", [(float("nan"), 0.0), (0.0, float("inf"))])
+def test_an_arm_that_reports_no_numbers_is_not_moved(device, guarded, positions):
+    device.positions = positions
+    with pytest.raises(CommandRefused, match="positions are not 2 finite numbers"):
+        guarded.start(path((0.1, 0.1)))
+    assert device.sent == []
+
+
 def test_before_the_cell_is_put_together_nothing_moves(device):
     with pytest.raises(CommandRefused, match="not open"):
         GuardedRobot(device, LIMITS, device.clock).start(path((0.1, 0.1)))
@@ -162,6 +178,30 @@ def test_where_the_other_arm_stands_follows_from_the_transforms_believed_now(cel
     far[0, 3] += 1.0
     cell.guard.place(far)
     cell.passive.robot.start(full_speed(cell.passive, REACHING)).wait(20)
+
+
+def test_one_arm_moves_at_a_time(cell):
+    motion = cell.active.robot.start(full_speed(cell.active, REACHING))
+    home = tuple(cell.passive.home)
+    with pytest.raises(CommandRefused, match="this one is moving"):
+        cell.passive.robot.start(full_speed(cell.passive, (home[0] + 0.1, *home[1:])))
+    motion.wait(20)
+    cell.passive.robot.start(full_speed(cell.passive, (home[0] + 0.1, *home[1:]))).wait(20)
+
+
+def test_an_arm_near_its_own_limit_of_clearance_gets_no_nearer_to_the_other(cell, monkeypatch):
+    geometry = cell.guard._geometry
+    monkeypatch.setattr(geometry.active, "own_clearance", lambda q: np.full(len(q), 0.002))
+    closing_in = lambda self, q_a, q_p, T: np.linspace(0.3, 0.005, len(np.atleast_2d(q_a)))  # noqa: E731
+    monkeypatch.setattr(type(geometry), "between", closing_in)
+    with pytest.raises(CommandRefused, match="of the other arm"):
+        cell.active.robot.start(full_speed(cell.active, REACHING))
+
+
+def test_clearance_that_is_no_number_is_refused(cell, monkeypatch):
+    monkeypatch.setattr(type(cell.guard._geometry), "between", lambda self, q_a, q_p, T: np.array([np.nan]))
+    with pytest.raises(CommandRefused, match="nan mm"):
+        cell.active.robot.start(full_speed(cell.active, REACHING))
 
 
 def test_an_arm_is_not_sent_into_the_floor(cell):

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import load_cell
 from dualcal_hal.errors import LinkLost
 from dualcal_hal.guard import GuardedRobot
@@ -203,7 +205,7 @@ def test_a_run_begun_anew_on_its_journal_ends_with_the_same_captures(session, tm
     (folder / "journal.jsonl").write_bytes(b"".join(lines[: 1 + finished]))
     file = load_cell(folder / "cell.yaml")
     resumed = Session(folder)
-    execute(file, Calibration(file.cell, CellModel(file.cell)), resumed, lambda event: None)
+    execute(Cell(file), Calibration(file.cell, CellModel(file.cell)), resumed, lambda event: None)
     captures = captures_of(resumed.journal, file.sha256, None).captures
     assert captures == read_captures(session / "captures.json").captures
 
@@ -278,6 +280,90 @@ def test_a_folder_with_something_in_it_is_not_written_to(session):
     assert sorted(path.name for path in session.iterdir()) == before
 
 
+def test_a_cell_that_its_backend_cannot_serve_is_refused_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = PAPER.read_text()
+    (tmp_path / "cell.yaml").write_text(text[: text.index("# The simulated world.")])
+    result = dualcal("run", "cell.yaml")
+    assert result.exit_code == 2
+    assert "simulation" in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["cell.yaml"]
+
+
+def test_values_nested_too_deeply_are_refused_in_words(tmp_path):
+    (tmp_path / "cell.yaml").write_text("[" * 5000)
+    (tmp_path / "captures.json").write_text("[" * 100000)
+    for arguments in (
+        ["run", tmp_path / "cell.yaml"],
+        ["run", PAPER, "--set", f"procedure.seed={'[' * 3000}"],
+        ["estimate", tmp_path / "captures.json", "--cell", PAPER],
+    ):
+        result = dualcal(*arguments)
+        assert result.exit_code == 2
+        assert result.stderr.startswith("dualcal: ")
+
+
+def test_a_full_disk_ends_the_run_with_the_file_and_the_reason(tmp_path, monkeypatch):
+    from dualcal_hal.session import folder
+
+    write = folder.write_atomically
+
+    def full(path, content):
+        if path.suffix == ".png" and "calibration-01" in path.name:
+            raise OSError(28, "No space left on device", str(path))
+        write(path, content)
+
+    monkeypatch.setattr(folder, "write_atomically", full)
+    result = dualcal("run", PAPER, "--out", tmp_path / "s", *sets(*SMALL))
+    assert result.exit_code == 1
+    assert "calibration-01-0.png: No space left on device" in result.stderr
+    assert "stopped: left, right" in result.stderr
+    assert len(read_captures(tmp_path / "s" / "captures.json").captures) == 3
+
+
+def test_a_session_that_is_gone_does_not_hide_why_the_run_ended(tmp_path, monkeypatch):
+    start, moves = GuardedRobot.start, []
+
+    def lossy(self, path):
+        moves.append(self.name)
+        if len(moves) == 12:
+            (tmp_path / "s").rename(tmp_path / "moved")
+            raise LinkLost(self.name, "move", "no answer", "check the cable")
+        return start(self, path)
+
+    monkeypatch.setattr(GuardedRobot, "start", lossy)
+    result = dualcal("run", PAPER, "--out", tmp_path / "s", *sets(*SMALL))
+    assert result.exit_code == 1
+    assert "check the cable" in result.stderr
+    assert "captures.json could not be written" in result.stderr
+
+
+def test_two_runs_begun_in_one_second_get_folders_of_their_own(tmp_path, monkeypatch):
+    from datetime import UTC, datetime
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tools.cli.run.utc_now", lambda: datetime(2030, 1, 2, 3, 4, 5, tzinfo=UTC))
+    for _ in range(2):
+        dualcal("run", PAPER, *sets(*SMALL, "procedure.verification.constraints=0"))
+    assert sorted(path.name for path in (tmp_path / "sessions").iterdir()) == [
+        "20300102-030405-paper",
+        "20300102-030405-paper-2",
+    ]
+
+
+@pytest.mark.parametrize("name", ["../../etc/x", "''", "a/b", ".hidden"])
+def test_a_name_that_is_no_file_name_is_refused(name):
+    result = dualcal("run", PAPER, "--dry-run", "--set", f"name={name}")
+    assert result.exit_code == 2
+    assert "--set name" in result.stderr
+
+
+def test_a_dry_run_as_json_is_the_plan():
+    plan = json.loads(dualcal("run", PAPER, "--dry-run", "--json", *sets(*SMALL)).stdout)
+    assert plan["provisional"] is True
+    assert len(plan["constraints"]) == 4
+
+
 def test_a_lost_link_ends_the_run_with_exit_code_1_and_keeps_what_was_captured(tmp_path, monkeypatch):
     start, moves = GuardedRobot.start, []
 
@@ -291,13 +377,15 @@ def test_a_lost_link_ends_the_run_with_exit_code_1_and_keeps_what_was_captured(t
     result = dualcal("run", PAPER, "--out", tmp_path / "s", *sets(*SMALL))
     assert result.exit_code == 1
     assert "check the cable" in result.stderr
-    assert "the arms were stopped" in result.stderr
+    assert "stopped: left, right" in result.stderr
     assert len(read_captures(tmp_path / "s" / "captures.json").captures) > 0
     assert not (tmp_path / "s" / "result.json").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("ignored_before", [False, True])
+@pytest.mark.parametrize(
+    ("number", "ignored_before"),
+    [(signal.SIGINT, False), (signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGHUP, False)],
+)
 def test_a_signal_stops_the_arms_keeps_the_session_and_exits_with_130(tmp_path, number, ignored_before):
     folder = tmp_path / "s"
     # As a script's background job is started: with SIGINT ignored.
@@ -314,8 +402,11 @@ def test_a_signal_stops_the_arms_keeps_the_session_and_exits_with_130(tmp_path, 
         for line in process.stdout:
             if line.startswith("calibration/00 position 2"):
                 process.send_signal(number)
-                process.send_signal(number)
                 break
+        # Impatience must not break into the end: arms are being stopped and captures written.
+        while process.poll() is None:
+            process.send_signal(number)
+            threading.Event().wait(0.005)
         _, errors = process.communicate(timeout=60)
     finally:
         process.kill()
@@ -324,7 +415,7 @@ def test_a_signal_stops_the_arms_keeps_the_session_and_exits_with_130(tmp_path, 
         process.stderr.close()
     assert process.returncode == 130
     assert number.name in errors
-    assert "the arms were stopped" in errors
+    assert "stopped: left, right" in errors
     assert "Traceback" not in errors
     assert len(read_captures(folder / "captures.json").captures) >= 2
 
@@ -381,9 +472,51 @@ def test_the_simulators_truth_changes_no_estimate(session, tmp_path):
     assert found["mismatch_mm"] == before["mismatch_mm"]
 
 
+def test_an_unfinished_constraint_of_a_session_is_left_out_with_the_reason(session, tmp_path):
+    shutil.copytree(session, tmp_path / "s")
+    document = json.loads((session / "captures.json").read_text())
+    started = {**document["captures"][8], "id": "calibration/09/0", "constraint": "calibration/09", "position": 0}
+    document["captures"].append({**started, "active_arrival": 99})
+    (tmp_path / "s" / "captures.json").write_text(json.dumps(document))
+    found = json.loads(dualcal("estimate", tmp_path / "s", "--json").stdout)
+    reason = "calibration/09 is not finished: 1 of 3 positions"
+    assert found["captures_rejected"] == [{"id": "calibration/09/0", "reason": reason}]
+    assert found["transforms"] == json.loads((session / "result.json").read_text())["transforms"]
+
+
+def test_a_capture_with_the_active_arm_elsewhere_is_left_out_with_the_reason(tmp_path):
+    document = json.loads(REFERENCE.read_text())
+    document["captures"][5]["active_joints_rad"][0] += 0.2
+    (tmp_path / "captures.json").write_text(json.dumps(document))
+    found = json.loads(dualcal("estimate", tmp_path / "captures.json", "--cell", PAPER, "--json").stdout)
+    (rejected,) = found["captures_rejected"]
+    assert rejected["id"] == "calibration/01/1"
+    assert "11.46 deg" in rejected["reason"]
+    assert found["mismatch_mm"]["after"]["max"] < 1e-6
+
+
+@pytest.mark.parametrize("name", ["captures.json", "cell.yaml", "journal.jsonl"])
+def test_a_result_never_replaces_what_it_is_made_from(session, tmp_path, name):
+    shutil.copytree(session, tmp_path / "s")
+    result = dualcal("estimate", tmp_path / "s", "--out", tmp_path / "s" / name)
+    assert result.exit_code == 2
+    assert "made from" in result.stderr
+    assert (tmp_path / "s" / name).read_bytes() == (session / name).read_bytes()
+
+
+def test_a_result_replaces_no_device(session):
+    result = dualcal("estimate", session, "--out", "/dev/null")
+    assert result.exit_code == 2
+    assert not Path("/dev/null").is_file()
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        (lambda d: d["captures"][3].update(image_px=[640, 480]), ["calibration/00/3", "640 x 480", "1024 x 768"]),
+        (lambda d: d["captures"][3].update(feature_px=[500.0, 383.5]), ["calibration/00/3", "is not corner 4"]),
+        (lambda d: d["captures"][3].update(position=-1), ["calibration/00/3", "position"]),
+        (lambda d: d["captures"][3].update(feature_px=[1, 2, 3]), ["calibration/00/3", "right length"]),
         (lambda d: d["captures"][4].update(active_joints_rad=[0.0] * 5), ["calibration/01/0"]),
         (lambda d: d["captures"][5].update(passive_joints_rad=[float("nan")] * 6), ["calibration/01/1"]),
         (lambda d: d.update(captures=[]), ["captures: is empty"]),

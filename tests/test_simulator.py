@@ -271,11 +271,14 @@ def test_a_segment_takes_as_long_as_its_trapezoid_or_triangle(way: float, expect
     assert stepper.follow(path, 0.0) == pytest.approx(expected)
 
 
-def test_a_path_is_never_faster_than_the_arm(exact: SimulatorBackend) -> None:
+def test_a_path_faster_than_the_arm_is_refused_and_the_arms_own_speed_is_kept(exact: SimulatorBackend) -> None:
     config = exact.cell.cell.robots[ACTIVE]
-    hurried = JointPath((away(ACTIVE, 0.8),), (1e3,) * 6, (1e4,) * 6)
+    speed, acceleration = tuple(config.speed), tuple(config.acceleration)
+    for hurried in ((tuple(2 * config.speed), acceleration), (speed, tuple(2 * config.acceleration))):
+        with pytest.raises(CommandRefused, match="beyond the arm's own"):
+            exact.robot(ACTIVE).start(JointPath((away(ACTIVE, 0.8),), *hurried))
     began = exact.clock.now()
-    exact.robot(ACTIVE).start(hurried).wait(TIMEOUT)
+    exact.robot(ACTIVE).start(JointPath((away(ACTIVE, 0.8),), speed, acceleration)).wait(TIMEOUT)
     slowest = 0.8 / config.speed.min() + config.speed.min() / config.acceleration.min()
     assert exact.clock.now() - began == pytest.approx(slowest)
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from backends.simulator.stepper import KinematicStepper, Stepper
+from backends.simulator.stepper import Stepper
 from dualcal_hal.errors import CommandRefused
 from dualcal_hal.robot import JointPath, Joints, Mode, Motion, RobotState, StopResult
 from dualcal_hal.transforms import Array
@@ -23,8 +21,7 @@ class SimulatedArm:
     def __init__(self, name: str, config: RobotConfig, world: World) -> None:
         self._name = name
         self._world = world
-        self._speed, self._acceleration = config.speed, config.acceleration
-        self._stepper: Stepper = KinematicStepper(config.home, config.acceleration)
+        self._stepper: Stepper = world.stepper(config.home, config.acceleration)
         self._motion: Motion | None = None
         self._stop_reason: str | None = None
         self._sequence = 0
@@ -59,7 +56,7 @@ class SimulatedArm:
             motion = self._motion = Motion(self._name, self._world.clock)
             self._stop_reason = None
             now = self._world.clock.now()
-            self._rest_anew(now, self._stepper.follow(self._within_bounds(path), now))
+            self._rest_anew(now, self._stepper.follow(path, now))
         self._world.clock.call_at(self._end, partial(self._finish, motion))
         return motion
 
@@ -127,8 +124,3 @@ class SimulatedArm:
     def _refuse_if_moving(self, attempted: str) -> None:
         if self._motion is not None:
             raise CommandRefused(self._name, attempted, "it is moving", "wait for its motion or stop it")
-
-    def _within_bounds(self, path: JointPath) -> JointPath:
-        speed = np.minimum(path.speed, self._speed)
-        acceleration = np.minimum(path.acceleration, self._acceleration)
-        return JointPath(path.waypoints, tuple(speed.tolist()), tuple(acceleration.tolist()))

@@ -34,7 +34,7 @@ class SimulatorBackend(Backend):
     """
 
     time: ClassVar[Literal["drives", "real"]] = "drives"
-    simulated: ClassVar[bool] = True
+    simulated = True
     Options: ClassVar[type[BaseModel]] = SimulatorOptions
 
     def __init__(self, name: str, cell: CellFile) -> None:

@@ -27,6 +27,7 @@ class SimulatedRobot(Robot):
     def __init__(self, name: str, config: RobotConfig, opened: Callable[[str, str], World]) -> None:
         self.name = name
         self._lower, self._upper = config.lower, config.upper
+        self._largest = {"speed": config.speed, "acceleration": config.acceleration}
         self._opened = opened
 
     @property
@@ -80,6 +81,8 @@ class SimulatedRobot(Robot):
         for what, values in bounds.items():
             if min(values) <= 0:
                 self._refuse(f"{what} must be above 0 for every joint")
+            if np.any(np.asarray(values) > self._largest[what] * (1 + 1e-9)):
+                self._refuse(f"{what} is beyond the arm's own")
         for what, values in waypoints.items():
             outside = np.maximum(self._lower - values, np.asarray(values) - self._upper)
             joint = int(np.argmax(outside))

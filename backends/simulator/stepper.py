@@ -113,3 +113,7 @@ def _segment(begin: float, start: Array, end: Array, speed: Array, acceleration:
     level = _Phase(up.end, cruise, up.sample(up.end)[0], peak * way, still)
     down = _Phase(level.end, ramp, level.sample(level.end)[0], peak * way, -gain * way)
     yield from (up, level, down)
+
+
+STEPPERS: dict[str, type[KinematicStepper]] = {"kinematic": KinematicStepper}
+"""By what a cell file calls them."""

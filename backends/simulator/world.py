@@ -10,6 +10,7 @@ import numpy as np
 
 from backends.simulator.arm import SimulatedArm
 from backends.simulator.noise import generator
+from backends.simulator.stepper import STEPPERS
 from dualcal_hal.clock import Clock
 from dualcal_hal.robot import Joints
 from dualcal_hal.transforms import Array, inverse
@@ -33,6 +34,7 @@ class World:
         self._truth = simulation.truth
         self._chains = simulation.truth.chains(cell)
         self._seed = simulation.seed
+        self.stepper = STEPPERS[simulation.stepper]
         self._samples: Counter[tuple[str, str]] = Counter()
         self.arms = {name: SimulatedArm(name, robot, self) for name, robot in sorted(cell.robots.items())}
 

@@ -18,6 +18,9 @@ from dualcal_hal.session.files import read_document, write_document
 
 FORMAT = "dualcal.captures/1"
 
+FARTHEST_FEATURE = 2.0
+"""px in each axis that the feature point may differ from its corner, which may have been measured in another way."""
+
 Use = Literal["calibration", "verification"]
 Pixel = tuple[float, float]
 
@@ -91,11 +94,19 @@ def write_captures(path: Path, captures: Captures) -> None:
     write_document(path, {"format": FORMAT, **known, "captures": entries})
 
 
-def read_captures(path: Path, *, joints: tuple[int, int] | None = None, corners: int | None = None) -> Captures:
+def read_captures(
+    path: Path,
+    *,
+    joints: tuple[int, int] | None = None,
+    corners: int | None = None,
+    feature: int | None = None,
+    image_size: tuple[int, int] | None = None,
+) -> Captures:
     """Read the public file.
 
-    joints: of the active and passive arm, corners: of the board, where the cell is known. Raises FormatError
-    with all problems, each at the capture's id or the file. Where no arrival is given a constraint is one.
+    joints: of the active and passive arm, corners: of the board, feature: the index of its feature point among them,
+    image_size: px, where the cell is known. Raises FormatError with all problems, each at the capture's id or the file.
+    Where no arrival is given a constraint is one.
     """
     document = read_document(path, FORMAT)
     problems = list(_header_problems(document, str(path)))
@@ -107,6 +118,10 @@ def read_captures(path: Path, *, joints: tuple[int, int] | None = None, corners:
         if entry is not None:
             entries.append(entry)
             problems += _mismatches(entry, joints, corners)
+            if image_size is not None and entry.image_px != image_size:
+                what = f"image_px: {_by(entry.image_px)} px, the cell's camera has {_by(image_size)}"
+                problems.append(Problem(entry.id, what))
+            problems += _stray_feature(entry, feature)
     problems += _duplicates([_name(record, index) for index, record in enumerate(raw)] if isinstance(raw, list) else [])
     if problems:
         raise FormatError(problems)
@@ -132,7 +147,7 @@ class _Entry(BaseModel):
     id: _Name
     use: Use
     constraint: _Name
-    position: _Whole
+    position: Annotated[int, Field(strict=True, ge=0)]
     active_arrival: _Whole | None = None
     active_joints_rad: _Joints
     passive_joints_rad: _Joints
@@ -168,12 +183,24 @@ def _entry(record: Any, name: str) -> tuple[_Entry | None, list[Problem]]:
         return None, [Problem(name, _words(details)) for details in error.errors()]
 
 
+_WORDS = {
+    "tuple_type": "must be a list",
+    "too_long": "must be a list of the right length",
+    "too_short": "must be a list of the right length",
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "string_type": "must be text",
+    "finite_number": "must be a finite number",
+}
+
+
 def _words(details: Any) -> str:
     key, *indices = details["loc"]
     where = f"{key}{''.join(f'[{index}]' for index in indices)}"
     if details["type"] == "missing":
         return f"{where}: missing"
-    return f"{where}: {details['msg'][0].lower()}{details['msg'][1:]}, not {str(details['input'])[:60]}"
+    said = _WORDS.get(details["type"], f"{details['msg'][0].lower()}{details['msg'][1:]}")
+    return f"{where}: {said}, not {str(details['input'])[:60]}"
 
 
 def _header_problems(document: Mapping[str, Any], file: str) -> Iterator[Problem]:
@@ -198,6 +225,18 @@ def _duplicates(names: Sequence[str]) -> Iterator[Problem]:
     for name in dict.fromkeys(names):
         if (count := names.count(name)) > 1:
             yield Problem(name, f"id: used by {count} captures")
+
+
+def _stray_feature(entry: _Entry, feature: int | None) -> Iterator[Problem]:
+    if feature is None or entry.corners_px is None or feature >= len(entry.corners_px):
+        return
+    corner = entry.corners_px[feature]
+    if max(abs(corner[0] - entry.feature_px[0]), abs(corner[1] - entry.feature_px[1])) > FARTHEST_FEATURE:
+        yield Problem(entry.id, f"feature_px: {entry.feature_px} is not corner {feature} of corners_px, {corner}")
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]} x {size[1]}"
 
 
 def _mismatches(entry: _Entry, joints: tuple[int, int] | None, corners: int | None) -> Iterator[Problem]:

@@ -48,11 +48,19 @@ def read_document(path: Path, expected_format: str) -> dict[str, Any]:
 def read_object(path: Path) -> dict[str, Any]:
     """A JSON object, else FormatError."""
     try:
-        document = json.loads(path.read_bytes())
+        document = json.loads(path.read_bytes(), object_pairs_hook=_without_duplicates)
     except OSError as error:
         raise FormatError([Problem(str(path), f"cannot be read: {error.strerror}")]) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError([Problem(str(path), f"is not JSON: {error}")]) from error
     if not isinstance(document, dict):
         raise FormatError([Problem(str(path), "is not a JSON object")])
     return document
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"key {next(name for name in names if names.count(name) > 1)!r} is given twice")
+    return entries

@@ -23,9 +23,9 @@ class Session:
     @staticmethod
     def create(folder: Path, cell_text: str) -> Session:
         """A new session in an empty or not yet existing folder, else UsageError."""
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise UsageError(f"{folder}: exists and is not an empty folder; name another with --out")
         try:
+            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+                raise UsageError(f"{folder}: exists and is not an empty folder; name another with --out")
             (folder / "images").mkdir(parents=True)
             write_atomically(folder / "cell.yaml", cell_text.encode())
         except OSError as error:

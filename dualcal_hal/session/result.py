@@ -124,7 +124,9 @@ def read_result(path: Path) -> Result:
 
 def read_truth(path: Path) -> dict[str, Array]:
     """True transforms by name, (4, 4) in m, from a JSON object that has both; FormatError otherwise."""
-    document, truth, problems = read_object(path), {}, []
+    document, truth = read_object(path), {}
+    unknown = sorted(set(document) - {T_P_A_NAME, T_H_E_NAME})
+    problems = [Problem(str(path), f"{name}: unknown transform") for name in unknown]
     for name in (T_P_A_NAME, T_H_E_NAME):
         if name not in document:
             problems.append(Problem(str(path), f"{name}: missing"))

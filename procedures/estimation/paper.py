@@ -33,7 +33,7 @@ UNCERTAIN = 0.05  # rad
 # 20 sets, the reference captures 0.41.
 WEAK = 0.04
 
-_TOO_WEAK = "the active flange is turned too little about a second axis"
+_TOO_WEAK = "the active flange is turned too little about a second axis, or the nominal transforms are far off"
 
 
 @dataclass(frozen=True)

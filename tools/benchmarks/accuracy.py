@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import load_cell
 from dualcal_hal.session.folder import Session
 from procedures.calibrate import Calibration, captures_of
@@ -45,7 +46,7 @@ def run(path: Path, seed: int, overrides: list[str]) -> Run:
 
     with tempfile.TemporaryDirectory() as folder:
         session = Session.create(Path(folder) / "session", file.text)
-        execute(file, Calibration(file.cell, CellModel(file.cell)), session, collect)
+        execute(Cell(file), Calibration(file.cell, CellModel(file.cell)), session, collect)
         result = conclude(file, session, captures_of(session.journal, file.sha256, None))
     assert result.truth_error is not None
     assert result.mismatch_after is not None

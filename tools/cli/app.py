@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.exits import reported, signals_handled
+from tools.cli.exits import ended_in_order
 
 app = typer.Typer(
     name="dualcal",
@@ -24,12 +24,6 @@ Set = Annotated[
 ]
 Method = Annotated[str | None, typer.Option(help="Estimator; overrides procedure.method.")]
 Json = Annotated[bool, typer.Option("--json", help="Print result.json alone on standard output.")]
-
-
-def main() -> None:
-    """Entry point of the ``dualcal`` command."""
-    with signals_handled():
-        app()
 
 
 @app.command()
@@ -50,7 +44,7 @@ def run(
     Exit code 0 for verdict ok, 1 for any other verdict or a device fault, 2 for a call, cell file or captures that
     cannot be used or when there is no plan, 130 when interrupted.
     """
-    with reported():
+    with ended_in_order():
         from tools.cli.run import RunOptions, run_cell
 
         code = run_cell(RunOptions(cell, out, seed, method, tuple(overrides or ()), dry_run, yes, json))
@@ -70,7 +64,7 @@ def estimate(
 
     Exit code 0 once a result is written, 2 for a call, cell file or captures that cannot be used.
     """
-    with reported():
+    with ended_in_order():
         from tools.cli.estimate import EstimateOptions, estimate_captures
 
         estimate_captures(EstimateOptions(captures, cell, method, truth, out, json))
@@ -79,7 +73,7 @@ def estimate(
 @app.command()
 def schema() -> None:
     """Print the JSON Schema of a cell file."""
-    with reported():
+    with ended_in_order():
         import json
 
         from dualcal_hal.cellfile import cell_schema

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
 
 from dualcal_hal.cellfile import CellFile, load_cell
+from dualcal_hal.config import CellConfig
 from dualcal_hal.errors import UsageError
 from dualcal_hal.session.captures import Captures, read_captures
 from dualcal_hal.session.folder import Session
-from dualcal_hal.session.result import read_truth, with_truth_error, write_result
+from dualcal_hal.session.result import Rejected, read_truth, with_truth_error, write_result
 from dualcal_hal.transforms import Array
 from procedures.analysis import analyse
-from procedures.calibrate import captures_of
+from procedures.calibrate import captures_of, finished
 from tools.cli.show import show_result
 from tools.cli.truth import simulated_truth
+
+SOURCES = ("captures.json", "cell.yaml", "journal.jsonl", "plan.json")
+"""Files of a session that no result may replace."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +38,11 @@ class EstimateOptions:
 
 def estimate_captures(options: EstimateOptions) -> None:
     """Analyse captures from anywhere; print the result and write it where asked."""
+    if not options.captures.exists():
+        raise UsageError(f"{options.captures}: does not exist")
+    _check_out(options)
     file = load_cell(_cell_path(options))
-    captures = _captures(options.captures, file)
+    captures, unfinished = _captures(options.captures, file)
     console = Console(stderr=options.json)
     ours = captures.cell_sha256 == file.sha256
     if captures.cell_sha256 is not None and not ours:
@@ -43,6 +50,7 @@ def estimate_captures(options: EstimateOptions) -> None:
             f"warning: the captures were taken with another cell file than {_cell_path(options)}", style="yellow"
         )
     result = analyse(captures, file.cell, options.method or file.cell.procedure.method)
+    result = replace(result, captures_rejected=(*result.captures_rejected, *unfinished))
     truth = _truth(options.truth, file if ours else None)
     if truth is not None:
         result = with_truth_error(result, truth)
@@ -63,14 +71,35 @@ def _cell_path(options: EstimateOptions) -> Path:
     raise UsageError(f"{options.captures}: there is no cell.yaml beside it; name the cell file with --cell")
 
 
-def _captures(path: Path, file: CellFile) -> Captures:
+def _check_out(options: EstimateOptions) -> None:
+    """Results replace results, never the data they come from, and no device."""
+    out = options.out
+    if out is None or not out.exists():
+        return
+    if not out.is_file():
+        raise UsageError(f"{out}: is no regular file")
+    folder = options.captures if options.captures.is_dir() else options.captures.parent
+    sources = (options.captures, *(folder / name for name in SOURCES), options.cell, options.truth)
+    if any(source is not None and source.exists() and out.samefile(source) for source in sources):
+        raise UsageError(f"{out}: is what the estimate is made from; name another file with --out")
+
+
+def _captures(path: Path, file: CellFile) -> tuple[Captures, tuple[Rejected, ...]]:
+    """The captures, and those of a session's unfinished constraint, which are left out."""
     cell = file.cell
-    joints = (cell.active.chain.joints, cell.passive.chain.joints)
-    source = path / "captures.json" if path.is_dir() else path
-    if path.is_dir() and not source.exists() and (path / "journal.jsonl").exists():
+    if not path.is_dir():
+        return _read(path, cell), ()
+    source = path / "captures.json"
+    if not source.exists() and (path / "journal.jsonl").exists():
         # A run that was killed had no time to write its captures; its journal has them.
-        return captures_of(Session(path).journal, file.sha256, None)
-    return read_captures(source, joints=joints, corners=len(cell.target.board.corners))
+        return finished(captures_of(Session(path).journal, file.sha256, None), cell.procedure)
+    return finished(_read(source, cell), cell.procedure)
+
+
+def _read(path: Path, cell: CellConfig) -> Captures:
+    joints = (cell.active.chain.joints, cell.passive.chain.joints)
+    board, size = cell.target.board, cell.camera.intrinsics.size
+    return read_captures(path, joints=joints, corners=len(board.corners), feature=board.feature, image_size=size)
 
 
 def _truth(path: Path | None, file: CellFile | None) -> Mapping[str, Array] | None:

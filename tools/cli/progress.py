@@ -7,8 +7,9 @@ from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Column
 
-from procedures.events import BeliefRefined, LookTaken, PlanReady, PointDone
+from procedures.events import BeliefRefined, LookTaken, PlanReady, PointDone, counted
 
 
 class Lines:
@@ -34,12 +35,13 @@ class Bars:
 
     def __init__(self, console: Console) -> None:
         self._bars = Progress(
-            TextColumn("{task.description:<12}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[latest]}"),
+            TextColumn("{task.description:<12}", table_column=Column(no_wrap=True, min_width=12)),
+            BarColumn(bar_width=12),
+            MofNCompleteColumn(table_column=Column(no_wrap=True, min_width=5)),
+            TimeElapsedColumn(table_column=Column(no_wrap=True, min_width=7)),
+            TextColumn("{task.fields[latest]}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)),
             console=console,
+            expand=True,
         )
         self._tasks: dict[str, TaskID] = {}
 
@@ -62,7 +64,7 @@ class Bars:
             case PointDone():
                 offset = "" if event.offset_px is None else f" {max(map(abs, event.offset_px)):.3f} px"
                 where = f"{event.constraint} position {event.position + 1}/{event.positions}"
-                text = f"{where}: {event.outcome}, {event.frames} pictures{offset}"
+                text = f"{where}: {event.outcome}, {counted(event.frames, 'picture')}{offset}"
                 self._advance(event.use, 0, text, by=1 if event.captured else 0)
             case BeliefRefined():
                 pass  # on a terminal the bars say enough

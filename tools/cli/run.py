@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
 import typer
@@ -12,7 +14,6 @@ from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.clock import utc_now
 from dualcal_hal.errors import UsageError
-from dualcal_hal.registry import backend_class
 from dualcal_hal.session.captures import Captures, write_captures
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.result import Result, with_truth_error, write_result
@@ -52,20 +53,24 @@ def run_cell(options: RunOptions) -> int:
     console = Console(stderr=options.json)
     model = CellModel(file.cell)
     calibration = Calibration(file.cell, model)
+    cell = Cell(file)
     _warn_of_alignment_error(console, file, model)
     if options.dry_run:
-        show_rehearsal(console, file.cell, rehearse(file.cell, model))
+        show_rehearsal(console, file.cell, rehearse(file.cell, model), as_json=options.json)
         return 0
-    _confirm(file, options.yes)
+    _confirm(cell, options.yes)
     started = utc_now()
-    folder = options.out or Path("sessions") / f"{started:%Y%m%d-%H%M%S}-{file.cell.name}"
-    session = Session.create(folder, file.text)
+    session = Session.create(options.out or _unused_folder(started, file.cell.name), file.text)
     try:
         with progress(console) as watcher:
-            execute(file, calibration, session, watcher)
-    finally:
-        captures = captures_of(session.journal, file.sha256, started.isoformat(timespec="seconds"))
-        write_captures(session.captures_path, captures)
+            execute(cell, calibration, session, watcher)
+    except BaseException as error:
+        try:
+            _write_captures(file, session, started)
+        except OSError as second:
+            error.add_note(f"captures.json could not be written ({second.strerror}); the journal has them")
+        raise
+    captures = _write_captures(file, session, started)
     result = conclude(file, session, captures)
     show_result(console, file.cell, result, simulated_truth(file), as_json=options.json)
     console.print(f"session: {session.folder}", soft_wrap=True, highlight=False)
@@ -83,15 +88,27 @@ def _load(options: RunOptions) -> CellFile:
     return load_cell(options.cell, overrides)
 
 
-def execute(file: CellFile, calibration: Calibration, session: Session, watcher: Observer) -> None:
+def _unused_folder(started: datetime, name: str) -> Path:
+    folder = Path("sessions") / f"{started:%Y%m%d-%H%M%S}-{name}"
+    numbered = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
+    return folder if not folder.exists() else next(other for other in numbered if not other.exists())
+
+
+def _write_captures(file: CellFile, session: Session, started: datetime) -> Captures:
+    captures = captures_of(session.journal, file.sha256, started.isoformat(timespec="seconds"))
+    write_captures(session.captures_path, captures)
+    return captures
+
+
+def execute(cell: Cell, calibration: Calibration, session: Session, watcher: Observer) -> None:
     """Run the procedure on the cell's devices, which are closed again on any exit."""
     try:
-        with Observers(watcher) as observers, Cell(file) as cell:
-            engine = Engine(cell, session, observers)
+        with Observers(watcher) as observers, cell as opened:
+            engine = Engine(opened, session, observers)
             with aborting_with(engine.abort):
                 engine.run(calibration.steps())
     except Exception as error:
-        error.add_note(f"the arms were stopped; what was captured is in {session.folder}")
+        error.add_note(f"what was captured is in {session.folder}")
         raise
 
 
@@ -115,11 +132,10 @@ def conclude(file: CellFile, session: Session, captures: Captures) -> Result:
     return result
 
 
-def _confirm(file: CellFile, yes: bool) -> None:
-    simulated = all(backend_class(entry.type).simulated for entry in file.cell.backends.values())
-    if simulated or yes:
+def _confirm(cell: Cell, yes: bool) -> None:
+    if cell.simulated or yes:
         return
-    if not typer.confirm(f"Cell '{file.cell.name}' is not simulated: both arms will move. Go on?", default=False):
+    if not typer.confirm("This cell is not simulated: both arms will move. Go on?", default=False):
         raise UsageError("not confirmed; nothing was moved")
 
 

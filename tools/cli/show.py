@@ -25,8 +25,11 @@ def show_result(
         console.print(result_tables(cell, result, truth))
 
 
-def show_rehearsal(console: Console, cell: CellConfig, rehearsal: Rehearsal) -> None:
-    """The way to the stand-off, the looks and the provisional plan."""
+def show_rehearsal(console: Console, cell: CellConfig, rehearsal: Rehearsal, *, as_json: bool) -> None:
+    """The way to the stand-off, the looks and the provisional plan; the plan alone (or null) for a program."""
+    if as_json:
+        typer.echo(json.dumps(None if rehearsal.plan is None else rehearsal.plan.to_record(), indent=1))
+        return
     console.print(f"Dry run of cell '{cell.name}': no device is opened.")
     if rehearsal.stand_off is not None:
         stand_off = rehearsal.stand_off

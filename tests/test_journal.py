@@ -67,6 +67,24 @@ def test_what_json_cannot_hold_is_refused_and_nothing_is_written(path):
     assert path.read_bytes() == before
 
 
+def test_a_line_is_on_disk_before_its_step_counts_as_finished(path, monkeypatch):
+    synced = []
+    monkeypatch.setattr("os.fsync", lambda descriptor: synced.append(path.read_bytes()))
+    Journal(path).append(FIRST, {"n": 1})
+    assert synced[-1] == path.read_bytes()
+    assert b'"n": 1' in synced[-1]
+
+
+def test_a_cut_off_line_longer_than_the_next_one_leaves_nothing_behind(path):
+    journal = Journal(path)
+    journal.append(FIRST, {"n": 1})
+    with path.open("ab") as file:
+        file.write(b'{"step": ' + b"x" * 1000)
+    Journal(path).append(SECOND, {"n": 2})
+    assert b"xxx" not in path.read_bytes()
+    assert [key for key, _ in Journal(path).results()] == [FIRST, SECOND]
+
+
 def test_going_on_after_a_cut_off_line_keeps_the_journal_readable(path):
     journal = Journal(path)
     journal.append(FIRST, {"n": 1})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 
 from dualcal_hal.errors import NoPlan
 from dualcal_hal.geometry import interpolate
-from dualcal_hal.transforms import inverse, rotation_from_vector
+from dualcal_hal.transforms import inverse, rotation_from_vector, transform
 from procedures.calibrate import requests_of
 from procedures.planning.belief import Belief
 from procedures.planning.first_look import find_stand_off, look_postures
@@ -187,6 +189,43 @@ def test_the_passive_arm_has_room_to_move_each_way_in_the_camera_plane(model, pl
 def test_flanges_are_turned_about_two_axes(model, plan):
     R = model.active.chain.forward([c.active for c in plan.of("calibration")])[:, :3, :3]
     assert turned_about_two_axes(R) >= LEAST_TURN
+
+
+def test_orientations_not_turned_about_two_axes_are_no_plan(cell, model, ways, stand_off, monkeypatch):
+    monkeypatch.setattr("procedures.planning.poses.turned_about_two_axes", lambda R: np.deg2rad(29.0))
+    with pytest.raises(NoPlan, match="not turned by 30 degrees about two axes"):
+        made(cell, model, ways, stand_off.posture)
+
+
+def test_positions_without_a_clear_way_between_them_are_no_plan(cell, model, stand_off, monkeypatch):
+    monkeypatch.setattr(WayFinder, "clear", lambda self, arm, start, waypoints: False)
+    ways = WayFinder(model, model.nominal, [model.home])
+    with pytest.raises(NoPlan, match=r"0 of 7.*the way between two positions is not clear: \d\d"):
+        made(cell, model, ways, stand_off.posture)
+
+
+def test_between_the_positions_of_a_constraint_the_passive_arm_goes_straight(model, plan):
+    for constraint in plan.constraints:
+        for one, other in itertools.pairwise(constraint.positions):
+            posture = Posture(constraint.active, one.passive)
+            path_a, path_p, _ = walk(model, posture, [Leg(model.passive.name, other.passive)])
+            assert clear_of_everything(model, path_a, path_p, model.nominal) > model.margin - 0.0013
+
+
+@pytest.mark.parametrize(
+    ("turn", "place", "seen"),
+    [
+        ([0, 0, 0], [0.0, 0.0, 0.4], True),
+        ([np.pi, 0, 0], [0.0, 0.0, 0.4], False),  # its back
+        ([0, 0, 0], [0.22, 0.0, 0.4], False),  # cut by the image's edge
+        ([0, 0, 0], [0.0, -0.17, 0.4], False),
+        ([0, 0, 0], [0.0, 0.0, -0.4], False),  # behind the camera
+        ([0, 0, 0], [0.0, 0.0, 0.1], False),  # too near to be whole
+    ],
+)
+def test_a_target_is_in_view_if_its_whole_front_is(model, turn, place, seen):
+    facing = rotation_from_vector([np.pi, 0, 0]) @ rotation_from_vector(turn)
+    assert model.in_view(transform(facing, place)[None])[0] == seen
 
 
 def test_axes_spread_over_the_shared_space(model, plan):

@@ -20,11 +20,13 @@ from typer.testing import CliRunner
 
 from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import load_cell
-from dualcal_hal.errors import LinkLost
+from dualcal_hal.errors import LinkLost, NotOpen
 from dualcal_hal.guard import GuardedRobot
 from dualcal_hal.session.captures import read_captures
 from dualcal_hal.session.folder import Session
 from procedures.calibrate import Calibration, captures_of
+from procedures.engine import Engine
+from procedures.observers import Observers
 from procedures.planning.model import CellModel
 from tests.cells import NOISELESS, PAPER, SMALL
 from tools.cli.app import app
@@ -157,6 +159,48 @@ def test_from_the_nominal_without_looks_every_point_is_aligned_or_replaced(tmp_p
     assert result.exit_code == 0
     assert len(json.loads(result.stdout)["captures_used"]) == 9
     assert not list((tmp_path / "s" / "images").glob("looks*"))
+
+
+def test_what_the_belief_has_outdated_is_planned_anew_and_the_plan_says_so(tmp_path):
+    dualcal("run", PAPER, "--out", tmp_path / "s", *sets(*SMALL, "procedure.first_looks=0"))
+    kinds = [key.kind for key, _ in Session(tmp_path / "s").journal.results()]
+    assert "replacement" in kinds
+    plan = json.loads((tmp_path / "s" / "plan.json").read_text())
+    captured = {capture.constraint for capture in read_captures(tmp_path / "s" / "captures.json").captures}
+    assert captured <= {constraint["constraint"] for constraint in plan["constraints"]}
+
+
+def test_on_a_good_end_both_arms_are_home_again_and_the_devices_closed(tmp_path):
+    file = load_cell(PAPER, SMALL)
+    session = Session.create(tmp_path / "s", file.text)
+    with Observers() as observers, Cell(file) as cell:
+        Engine(cell, session, observers).run(Calibration(file.cell, CellModel(file.cell)).steps())
+        for arm in (cell.active, cell.passive):
+            np.testing.assert_allclose(arm.robot.read(1.0).positions, arm.home, atol=1e-4)
+    for arm in (cell.active, cell.passive):
+        with pytest.raises(NotOpen):
+            arm.robot.read(1.0)
+
+
+def test_captures_of_a_constraint_that_was_given_up_are_left_out(session, tmp_path):
+    shutil.copytree(session, tmp_path / "s")
+    journal = tmp_path / "s" / "journal.jsonl"
+    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    for line in lines[1:]:
+        if line["step"]["constraint"] == "calibration/01" and line["step"]["position"] == 2:
+            line["result"].update(capture=None, outcome="lost")
+    journal.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    captures = captures_of(Session(tmp_path / "s").journal, "", None).captures
+    assert {capture.constraint for capture in captures} == {"calibration/00", "calibration/02", "verification/00"}
+
+
+def test_an_alignment_error_above_the_arms_repeatability_is_warned_of():
+    quiet = dualcal("run", PAPER, "--dry-run", *sets(*SMALL)).stdout
+    assert "e_c_max 0.087 mm" in quiet
+    assert "warning" not in quiet
+    loud = dualcal("run", PAPER, "--dry-run", *sets(*SMALL, "robots.right.repeatability_mm=0.05")).stdout
+    assert "warning: e_c_max 0.087 mm" in loud
+    assert "exceeds the arms' repeatability of 0.05 mm" in " ".join(loud.split())
 
 
 def test_a_run_without_verification_is_unverified_and_not_a_success(tmp_path):

@@ -24,7 +24,7 @@ from backends.simulator.stepper import KinematicStepper
 from backends.simulator.world import World
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.clock import VirtualClock
-from dualcal_hal.errors import CellFileError, DeviceError, MotionStopped
+from dualcal_hal.errors import CellFileError, CommandRefused, DeviceError, MotionStopped
 from dualcal_hal.registry import backend_class
 from dualcal_hal.robot import JointPath, Joints, Motion, MotionState, RobotState
 from dualcal_hal.transforms import Array

@@ -128,6 +128,7 @@ class GuardedRobot(Robot):
         return self._robot.subscribe(function)
 
     def start(self, path: JointPath) -> Motion:
+        """Begin to follow ``path`` (rad, rad/s, rad/s^2) if nothing speaks against it, else CommandRefused."""
         if self._check_cell is None:
             raise CommandRefused(self.name, "move", "the cell is not open", "open it first")
         self._check_values(path)

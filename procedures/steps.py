@@ -21,10 +21,14 @@ Procedure = Generator[Any, Any, T]
 class Record(Protocol):
     """A result that survives in the journal: plain JSON, with units in the names."""
 
-    def to_record(self) -> dict[str, Any]: ...
+    def to_record(self) -> dict[str, Any]:
+        """The result as JSON."""
+        ...
 
     @classmethod
-    def from_record(cls, record: dict[str, Any]) -> Self: ...
+    def from_record(cls, record: dict[str, Any]) -> Self:
+        """The same result again, to the last bit."""
+        ...
 
 
 R = TypeVar("R", bound=Record)
@@ -114,24 +118,29 @@ class Task:
 
 
 def read() -> Procedure[Readings]:
+    """What both arms report now."""
     reply: Readings = yield Read()
     return reply
 
 
 def move(arm: str, goal: Joints) -> Procedure[RobotState]:
+    """Move an arm to ``goal`` (rad); the state in which it has settled."""
     reply: RobotState = yield Move(arm, goal)
     return reply
 
 
 def look() -> Procedure[Sighting]:
+    """A picture and where both arms stood; ArmMoved is thrown in if they did not stand."""
     reply: Sighting = yield Look()
     return reply
 
 
 def tell(event: object) -> Procedure[None]:
+    """Hand an event to the observers."""
     yield Tell(event)
 
 
 def task(key: StepKey, body: Callable[[], Procedure[R]], result: type[R]) -> Procedure[R]:
+    """The result of ``body``, or the one that the journal has for ``key``."""
     reply: R = yield Task(key, body, result)
     return reply

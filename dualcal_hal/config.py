@@ -598,8 +598,8 @@ class SimulationConfig(Section):
 class CellConfig(Section):
     """Two arms facing each other, and what is to be done with them."""
 
-    name: Annotated[str, Field(pattern=r"^\w[\w .-]*$")]
-    """Names the session: letters, digits, spaces, dots, dashes and underscores."""
+    name: Annotated[str, Field(pattern=r"^[^\s./\\:*?\"<>|][^/\\:*?\"<>|\x00-\x1f]*$")]
+    """Names the session's folder: no separators, none of : * ? " < > |, no dot or space first."""
     backends: dict[str, BackendEntry]
     """What the devices are reached through, by a name of your own."""
     robots: dict[str, RobotConfig]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -18,6 +19,9 @@ READ_TIMEOUT = 0.5
 
 OLDEST_FEEDBACK = 0.1
 """Seconds after which a state no longer says where an arm is."""
+
+CLOCK_SLACK = 0.005
+"""Seconds that a state may seem to be ahead where times were taken from one clock to another."""
 
 STANDSTILL = 0.01
 """rad/s below which a joint counts as standing; readings of a resting arm scatter."""
@@ -53,8 +57,9 @@ class CellGuard:
         self._geometry = geometry
         self._T_P_A = T_P_A
         self._clearance = clearance * PLANNERS_SHARE
-        active.admit(self._check_active)
-        passive.admit(self._check_passive)
+        one_at_a_time = threading.Lock()
+        active.admit(self._check_active, one_at_a_time)
+        passive.admit(self._check_passive, one_at_a_time)
 
     def place(self, T_P_A: Array) -> None:
         """Judge clearance with the bases at this ``T_P_A`` (4, 4) from here on; before, it is the nominal one."""
@@ -106,6 +111,7 @@ class GuardedRobot(Robot):
         self._limits = limits
         self._clock = clock
         self._check_cell: Callable[[Array], None] | None = None
+        self._starting = threading.Lock()
         self._motion: Motion | None = None
 
     @property
@@ -113,9 +119,12 @@ class GuardedRobot(Robot):
         """Whether the motion that was started last has not ended."""
         return self._motion is not None and self._motion.state is MotionState.RUNNING
 
-    def admit(self, check: Callable[[Array], None]) -> None:
-        """Let ``check`` judge each sampled path (k, n); without it nothing moves (called by CellGuard)."""
-        self._check_cell = check
+    def admit(self, check: Callable[[Array], None], lock: threading.Lock) -> None:
+        """Let ``check`` judge each sampled path (k, n); without it nothing moves (called by CellGuard).
+
+        ``lock`` is held from the judging until the motion has begun, so that no other begins meanwhile.
+        """
+        self._check_cell, self._starting = check, lock
 
     @property
     def joints(self) -> int:
@@ -132,11 +141,15 @@ class GuardedRobot(Robot):
         if self._check_cell is None:
             raise CommandRefused(self.name, "move", "the cell is not open", "open it first")
         self._check_values(path)
+        with self._starting:
+            return self._start(path, self._check_cell)
+
+    def _start(self, path: JointPath, check_cell: Callable[[Array], None]) -> Motion:
         state = self.fresh_state("move")
         if state.mode is not Mode.READY or state.faults:
             what = ", ".join([f"mode '{state.mode}'", *state.faults])
             raise CommandRefused(self.name, "move", f"the arm is not ready: {what}", "clear it at the controller")
-        self._check_cell(interpolate([state.positions, *path.waypoints]))
+        check_cell(interpolate([state.positions, *path.waypoints]))
         self._motion = self._robot.start(path)
         return self._motion
 
@@ -156,7 +169,7 @@ class GuardedRobot(Robot):
         """The arm's state, read now; CommandRefused if it is not fresh or no joint angles."""
         state = self._robot.read(READ_TIMEOUT)
         age = self._clock.now() - state.time
-        if not 0.0 <= age <= OLDEST_FEEDBACK:
+        if not -CLOCK_SLACK <= age <= OLDEST_FEEDBACK:
             raise CommandRefused(self.name, attempted, f"its state is {age:.2f} s old", "check the link to the arm")
         for what, values in (("positions", state.positions), ("velocities", state.velocities)):
             if len(values) != len(self._limits.lower) or not np.all(np.isfinite(values)):

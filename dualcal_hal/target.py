@@ -32,6 +32,11 @@ class Checkerboard:
         corners = np.stack([x, y, np.zeros_like(x)], axis=1)
         return np.asarray(corners - corners[self.feature])
 
+    @property
+    def feature_is_central(self) -> bool:
+        """Whether the feature point is the middle corner, which is the same in whatever order the corners are read."""
+        return 2 * self.feature + 1 == self.rows * self.columns
+
     @cached_property
     def outline(self) -> Array:
         """(4, 3): the outer corners of the pattern's squares in T, m (one square beyond the inner corners)."""

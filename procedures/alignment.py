@@ -16,6 +16,7 @@ import numpy as np
 from dualcal_hal.errors import UsageError
 from dualcal_hal.robot import Joints
 from dualcal_hal.transforms import Array, inverse, rotation_angle, transform
+from procedures.analysis import FARTHEST_ALIGNED
 from procedures.detection import Detection, Detector, board_poses
 from procedures.estimation.projection import undistort
 from procedures.planning.belief import Belief
@@ -26,9 +27,6 @@ from procedures.seeing import see
 from procedures.steps import Procedure, Sighting, move, read
 
 MOST_FRAMES = 12
-ACCEPTABLE_PX = 1.0
-"""An offset (px) within which a point that did not converge is still captured, marked as such."""
-
 LONGEST_STEP = 0.3
 """m; a longer correction is a wrong one."""
 
@@ -40,6 +38,9 @@ AUTO_TOLERANCE = 2.8
 
 SMALL_CORRECTION_PX = 3.0
 """After a correction this small (px) what is left of the offset is the arrival's scatter, not the servo's error."""
+
+MEDIAN_TO_SIGMA = 1.4826
+"""Sigma of a normal distribution over the median of its magnitudes."""
 
 LEAST_ARRIVALS = 8
 """Arrivals after small corrections from which on their scatter counts as measured."""
@@ -78,7 +79,7 @@ class Alignment:
         """Whether the point is one to calibrate with."""
         if self.outcome is Outcome.ALIGNED:
             return True
-        near = self.offset is not None and bool(np.max(np.abs(self.offset)) <= ACCEPTABLE_PX)
+        near = self.offset is not None and bool(np.max(np.abs(self.offset)) <= FARTHEST_ALIGNED)
         return self.outcome is Outcome.NOT_CONVERGED and near
 
 
@@ -86,14 +87,15 @@ def tolerance_px(model: CellModel, wanted: float | str, arrivals: Sequence[Array
     """The tolerance in px per axis.
 
     ``auto`` follows the scatter of arrivals: the one that the stated joint noise implies or, where it is larger, the
-    one of the ``arrivals`` so far (offsets (2,) in px that were left after small corrections). Raises UsageError for a
-    tolerance below twice the implied scatter, which most arrivals would miss by chance.
+    one of the ``arrivals`` so far (offsets (2,) in px that were left after small corrections), up to what still counts
+    as aligned. Raises UsageError for a tolerance below twice the implied scatter, which most arrivals would miss.
     """
     scatter = arrival_scatter(model)
     if wanted == "auto":
         if len(arrivals) >= LEAST_ARRIVALS:
-            scatter = max(scatter, float(np.sqrt(np.mean(np.square(arrivals)))))
-        return max(LEAST_AUTO_PX, AUTO_TOLERANCE * scatter)
+            # By the median: one arrival gone astray must not open the door to others.
+            scatter = max(scatter, MEDIAN_TO_SIGMA * float(np.median(np.abs(arrivals))))
+        return min(max(LEAST_AUTO_PX, AUTO_TOLERANCE * scatter), FARTHEST_ALIGNED)
     tolerance = float(wanted)
     if tolerance < 2 * scatter:
         raise UsageError(
@@ -206,7 +208,7 @@ class Aligner:
                 # An arm was not at rest yet; the same place is tried again.
                 reply = replace(reply, frames=frames, reason=picture.reason)
                 continue
-            if picture.detection is None:
+            if picture.detection is None or not (picture.detection.order_known or self._model.board.feature_is_central):
                 return Alignment(Outcome.LOST, frames, reply.offset, picture.reason, arrivals=arrivals)
             sighting, seen = picture.sighting, picture.detection
             offset = seen.feature - self._model.intrinsics.principal_point
@@ -252,7 +254,7 @@ class Aligner:
         predicted = inverse(T_P_E) @ T_P_T
         T_E_T = min(poses, key=lambda T: float(rotation_angle(T[:3, :3], predicted[:3, :3])))
         if self._servo is None:
-            self._servo = Servo(self._first_jacobian(sighting, T_E_T, T_P_T, T_P_E))
+            self._servo = Servo(self._first_jacobian(sighting, T_E_T, T_P_T, T_P_E) if seen.order_known else np.eye(2))
         intrinsics = model.intrinsics
         ray = undistort(seen.feature, intrinsics.matrix, intrinsics.distortion)
         return np.asarray(ray * T_E_T[2, 3]), self._servo

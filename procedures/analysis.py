@@ -16,7 +16,11 @@ from dualcal_hal.transforms import Array
 from procedures.estimation import Degenerate, Estimate, Iteration, Statistics, estimate, judge, mismatch, statistics
 
 FARTHEST_ALIGNED = 1.0
-"""px in each axis; a feature point farther from the principal point than this does not count as aligned."""
+"""px in each axis; a feature point farther from the principal point than this does not count as aligned, one within
+it is a capture even where the alignment did not converge."""
+
+FEWEST_POSITIONS = 3
+"""Positions that make a line; a constraint that loses more to rejected captures is left out as a whole."""
 
 FARTHEST_ARRIVED = 5e-3
 """rad; an active joint farther than this from where the constraint's others have it stands on another axis."""
@@ -72,8 +76,10 @@ def _sort_out(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[list
     arrivals = {capture.active_arrival for capture in calibrated}
     stands = _active_joints(captures)
     used, rejected = [], []
+    thinned: set[tuple[Use, str]] = set()
     for capture in captures:
-        moved = float(np.max(np.abs(np.array(capture.active_joints) - stands[capture.use, capture.constraint])))
+        away = np.array(capture.active_joints) - stands[capture.use, capture.constraint]
+        moved = float(np.max(np.abs(np.angle(np.exp(1j * away)))))  # whole turns are the same place
         offset = np.abs(np.array(capture.feature) - cell.camera.intrinsics.principal_point)
         if np.any(offset > FARTHEST_ALIGNED):
             reason = f"not aligned: the feature point is {offset[0]:.2f} and {offset[1]:.2f} px off the optical axis"
@@ -88,7 +94,16 @@ def _sort_out(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[list
             used.append(capture)
             continue
         rejected.append(Rejected(capture.id, reason))
-    return used, tuple(rejected)
+        thinned.add((capture.use, capture.constraint))
+    kept = []
+    for capture in used:
+        place = capture.use, capture.constraint
+        left = sum((other.use, other.constraint) == place for other in used)
+        if capture.use == "calibration" and place in thinned and left < FEWEST_POSITIONS:
+            rejected.append(Rejected(capture.id, f"only {left} usable positions are left of {capture.constraint}"))
+        else:
+            kept.append(capture)
+    return kept, tuple(rejected)
 
 
 def _estimate(captures: Sequence[CaptureRecord], cell: CellConfig) -> Estimate:

@@ -176,7 +176,7 @@ class Calibration:
             if not (yield from self._go(posture)):
                 continue
             picture = yield from see(self._model, self._detector, self._belief)
-            if picture.sighting is not None and picture.detection is not None:
+            if picture.sighting is not None and picture.detection is not None and not picture.reason:
                 yield KeepImage(f"looks/{number}", picture.sighting.frame.image)
                 joints = picture.sighting.active, picture.sighting.passive
                 return LookRecord(View(*joints, picture.detection.corners), "")
@@ -254,7 +254,9 @@ class Calibration:
         self, constraint: PlannedConstraint, position: int, arrival: int, alignment: Alignment, aligner: Aligner
     ) -> Procedure[PointRecord]:
         sighting, seen = alignment.sighting, alignment.detection
-        view = None if sighting is None or seen is None else View(sighting.active, sighting.passive, seen.corners)
+        view = None
+        if sighting is not None and seen is not None and seen.order_known:
+            view = View(sighting.active, sighting.passive, seen.corners)
         capture = None
         if alignment.captured and sighting is not None and seen is not None:
             name = f"{constraint.name}/{position}"

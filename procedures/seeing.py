@@ -15,7 +15,10 @@ from procedures.steps import Procedure, Sighting, look
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a picture showed: the corners, or why there are none to use. No sighting if an arm moved meanwhile."""
+    """What a picture showed: the corners, or why there are none; no sighting if an arm moved meanwhile.
+
+    ``reason`` is empty if all is known of what was seen.
+    """
 
     sighting: Sighting | None
     detection: Detection | None
@@ -25,8 +28,8 @@ class Seen:
 def see(model: CellModel, detector: Detector, belief: Belief) -> Procedure[Seen]:
     """Take a picture from where the arms stand and find the target in it.
 
-    Corners whose order is not known are of no use here: an even pattern's feature point would be another corner, and
-    a fit to all corners would be to the wrong ones.
+    Where the order of the corners is not known the reason says so; the corners are given, for the feature point of an
+    odd pattern is the middle one in any order.
     """
     try:
         sighting = yield from look()
@@ -37,5 +40,5 @@ def see(model: CellModel, detector: Detector, belief: Belief) -> Procedure[Seen]
     if isinstance(found, Missed):
         return Seen(sighting, None, f"{found.reason}: {found.detail}")
     if not found.order_known:
-        return Seen(sighting, None, "the pattern could be seen from two sides: the order of its corners is not known")
+        return Seen(sighting, found, "the pattern could be seen from two sides: the order of its corners is not known")
     return Seen(sighting, found)

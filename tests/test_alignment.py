@@ -24,6 +24,7 @@ from procedures.alignment import (
     target_on_axis,
     tolerance_px,
 )
+from procedures.analysis import FARTHEST_ALIGNED
 from procedures.calibrate import requests_of
 from procedures.detection import Detector
 from procedures.planning.belief import Belief
@@ -275,9 +276,16 @@ def test_an_arm_that_never_rests_gives_no_capture(model, plan):
     assert "moved" in found.reason
 
 
-def test_corners_whose_order_is_not_known_are_no_capture(model, plan):
-    cell = Cell(model, plan, turned(model.nominal, camera=(0, 0, np.pi / 4)))
-    found = cell.align()
+def test_the_middle_corner_is_aligned_in_whatever_order_the_corners_are_read(model, plan):
+    found = Cell(model, plan, turned(model.nominal, camera=(0, 0, np.pi / 4))).align()
+    assert found.outcome is Outcome.ALIGNED
+    assert not found.detection.order_known
+
+
+def test_another_feature_point_is_lost_if_the_order_of_the_corners_is_not_known(plan):
+    even = CellModel(paper_cell("target.corners=[4, 4]", "target.feature_corner=[1, 1]").cell)
+    assert not even.board.feature_is_central
+    found = Cell(even, plan, turned(even.nominal, camera=(0, 0, np.pi / 4))).align()
     assert found.outcome is Outcome.LOST
     assert "order" in found.reason
 
@@ -334,7 +342,10 @@ def test_auto_follows_the_scatter_that_is_seen_where_it_is_larger_than_the_one_s
     model = CellModel(paper_cell().cell)
     stated = tolerance_px(model, "auto")
     shaky = [np.array([0.2, -0.2]), np.array([-0.2, 0.2])] * 10
-    assert tolerance_px(model, "auto", shaky) == pytest.approx(2.8 * 0.2)
+    assert tolerance_px(model, "auto", shaky) == pytest.approx(2.8 * 1.4826 * 0.2)
+    astray = [*shaky, np.array([50.0, 50.0])]
+    assert tolerance_px(model, "auto", astray) == pytest.approx(2.8 * 1.4826 * 0.2)
+    assert tolerance_px(model, "auto", [5 * offset for offset in shaky]) == FARTHEST_ALIGNED
     assert tolerance_px(model, "auto", shaky[:5]) == stated
     assert tolerance_px(model, "auto", [np.array([0.001, 0.001])] * 20) == stated
     assert tolerance_px(model, 0.1, shaky) == 0.1

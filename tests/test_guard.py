@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -60,7 +62,7 @@ def device():
 @pytest.fixture
 def guarded(device):
     robot = GuardedRobot(device, LIMITS, device.clock)
-    robot.admit(lambda path: None)
+    robot.admit(lambda path: None, threading.Lock())
     return robot
 
 
@@ -143,7 +145,7 @@ def test_before_the_cell_is_put_together_nothing_moves(device):
 def test_the_whole_path_is_judged_from_where_the_arm_stands(device):
     judged = []
     robot = GuardedRobot(device, LIMITS, device.clock)
-    robot.admit(judged.append)
+    robot.admit(judged.append, threading.Lock())
     device.positions = (0.4, 0.4)
     robot.start(path((0.8, -0.4), (0.0, 0.0)))
     np.testing.assert_allclose(judged[0][0], [0.4, 0.4])

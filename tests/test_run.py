@@ -464,6 +464,80 @@ def test_a_signal_stops_the_arms_keeps_the_session_and_exits_with_130(tmp_path, 
     assert len(read_captures(folder / "captures.json").captures) >= 2
 
 
+SLOW_CLOSE = """
+import os, signal, threading
+from backends.simulator import SimulatorBackend
+from backends.simulator.robot import SimulatedRobot
+from dualcal_hal.errors import LinkLost
+from dualcal_hal.robot import StopResult
+
+start, close, begun = SimulatedRobot.start, SimulatorBackend.close, []
+
+def lossy(self, path):
+    begun.append(self.name)
+    if len(begun) == 3:
+        raise LinkLost(self.name, "move", "cable out", "check the plug")
+    return start(self, path)
+
+def slow(self):
+    os.kill(os.getpid(), signal.SIGTERM)
+    threading.Event().wait(0.3)
+    close(self)
+    print("closed", flush=True)
+
+SimulatedRobot.start, SimulatorBackend.close = lossy, slow
+SimulatedRobot.stop = lambda self, reason: StopResult(False, "no answer")
+from tools.cli import main
+main()
+"""
+
+
+def test_a_signal_while_devices_are_closed_hides_neither_the_fault_nor_the_arms_that_may_still_move(tmp_path):
+    arguments = ["run", PAPER, "--out", tmp_path / "s", *sets(*SMALL)]
+    command = [sys.executable, "-c", SLOW_CLOSE, *map(str, arguments)]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=PAPER.parent.parent, check=False, timeout=60)
+    assert "closed" in ended.stdout
+    assert "check the plug" in ended.stderr
+    assert "it may still move: use the emergency stop" in ended.stderr
+    assert ended.returncode == 130
+
+
+SWALLOWED = """
+import os, signal, sys, weakref
+import dualcal_hal.cellfile as cellfile
+
+class Thing: pass
+
+load = cellfile._load
+
+def load_with_a_signal_where_no_exception_comes_out(*arguments):
+    thing = Thing()
+    reference = weakref.ref(thing, lambda _: os.kill(os.getpid(), signal.SIGINT))
+    del thing
+    return load(*arguments)
+
+cellfile._load = load_with_a_signal_where_no_exception_comes_out
+from tools.cli import main
+main()
+"""
+
+
+def test_a_signal_that_python_swallows_ends_the_run_before_any_device_is_opened(tmp_path):
+    command = [sys.executable, "-c", SWALLOWED, "run", str(PAPER), "--out", str(tmp_path / "s")]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=PAPER.parent.parent, check=False, timeout=60)
+    assert ended.returncode == 130
+    assert "interrupted by SIGINT" in ended.stderr
+    assert "look 1" not in ended.stdout
+
+
+def test_without_anybody_to_write_to_a_result_is_still_written(session, tmp_path):
+    program = shlex.join([sys.executable, "-c", "from tools.cli import main; main()"])
+    shell = f"{program} estimate {shlex.quote(str(session))} --out {shlex.quote(str(tmp_path / 'r.json'))} >&-"
+    ended = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, cwd=PAPER.parent.parent, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert (tmp_path / "r.json").exists()
+
+
 # -- estimate --------------------------------------------------------------------------------------
 
 
@@ -537,6 +611,25 @@ def test_a_capture_with_the_active_arm_elsewhere_is_left_out_with_the_reason(tmp
     assert rejected["id"] == "calibration/01/1"
     assert "11.46 deg" in rejected["reason"]
     assert found["mismatch_mm"]["after"]["max"] < 1e-6
+
+
+def test_a_constraint_thinned_by_rejected_captures_is_left_out_as_a_whole(tmp_path):
+    document = json.loads(REFERENCE.read_text())
+    for index in (4, 5):
+        document["captures"][index]["active_joints_rad"][0] += 0.05 * (index - 3)
+    (tmp_path / "captures.json").write_text(json.dumps(document))
+    found = json.loads(dualcal("estimate", tmp_path / "captures.json", "--cell", PAPER, "--json").stdout)
+    assert {rejected["id"] for rejected in found["captures_rejected"]} == {f"calibration/01/{i}" for i in range(4)}
+    assert len(found["captures_used"]) == 24
+    assert found["mismatch_mm"]["after"]["max"] < 1e-6
+
+
+def test_a_joint_read_a_whole_turn_off_stands_where_the_others_do(tmp_path):
+    document = json.loads(REFERENCE.read_text())
+    document["captures"][5]["active_joints_rad"][5] -= 2 * np.pi
+    (tmp_path / "captures.json").write_text(json.dumps(document))
+    found = json.loads(dualcal("estimate", tmp_path / "captures.json", "--cell", PAPER, "--json").stdout)
+    assert found["captures_rejected"] == []
 
 
 @pytest.mark.parametrize("name", ["captures.json", "cell.yaml", "journal.jsonl"])

@@ -50,7 +50,10 @@ def estimate_captures(options: EstimateOptions) -> None:
             f"warning: the captures were taken with another cell file than {_cell_path(options)}", style="yellow"
         )
     result = analyse(captures, file.cell, options.method or file.cell.procedure.method)
-    result = replace(result, captures_rejected=(*result.captures_rejected, *unfinished))
+    if unfinished:
+        said = f"{len(unfinished)} captures of a constraint that is not finished left out"
+        rejected = (*result.captures_rejected, *unfinished)
+        result = replace(result, captures_rejected=rejected, reasons=(*result.reasons, said))
     truth = _truth(options.truth, file if ours else None)
     if truth is not None:
         result = with_truth_error(result, truth)
@@ -87,12 +90,13 @@ def _check_out(options: EstimateOptions) -> None:
 def _captures(path: Path, file: CellFile) -> tuple[Captures, tuple[Rejected, ...]]:
     """The captures, and those of a session's unfinished constraint, which are left out."""
     cell = file.cell
-    if not path.is_dir():
-        return _read(path, cell), ()
-    source = path / "captures.json"
-    if not source.exists() and (path / "journal.jsonl").exists():
+    folder = path if path.is_dir() else path.parent
+    source = path / "captures.json" if path.is_dir() else path
+    if not (folder / "journal.jsonl").exists():
+        return _read(source, cell), ()
+    if not source.exists():
         # A run that was killed had no time to write its captures; its journal has them.
-        return finished(captures_of(Session(path).journal, file.sha256, None), cell.procedure)
+        return finished(captures_of(Session(folder).journal, file.sha256, None), cell.procedure)
     return finished(_read(source, cell), cell.procedure)
 
 

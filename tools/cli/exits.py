@@ -18,15 +18,52 @@ FAULT, USAGE, INTERRUPTED = 1, 2, 130
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
-_requests: SimpleQueue[str | None] | None = None
-_ending = False
+
+class _Break(BaseException):
+    """A signal outside a run: no ``except Exception`` on the way may take it for its own."""
+
+
+class DeferredSignals:
+    """Signals while devices are open: they ask the run to end and break into nothing, however many come."""
+
+    def __init__(self) -> None:
+        self._requests: SimpleQueue[str | None] = SimpleQueue()
+        self._lock = threading.Lock()
+        self._reason: str | None = None
+        self._abort: Callable[[str], None] | None = None
+        self._thread = threading.Thread(target=self._serve, name="signals", daemon=True)
+        self._thread.start()
+
+    def request(self, reason: str) -> None:
+        """Called by the handler: of all ways to tell another thread, this queue alone may be used there."""
+        self._requests.put(reason)
+
+    def pass_on_to(self, abort: Callable[[str], None]) -> None:
+        """Hand requests to ``abort``, one that has come already at once."""
+        with self._lock:
+            self._abort = abort
+            if self._reason is not None:
+                abort(self._reason)
+
+    def close(self) -> None:
+        """Hand out nothing any more."""
+        self._requests.put(None)
+        self._thread.join()
+
+    def _serve(self) -> None:
+        while (reason := self._requests.get()) is not None:
+            with self._lock:
+                self._reason = self._reason or reason
+                if self._abort is not None:
+                    self._abort(self._reason)
+
+
+_deferred: DeferredSignals | None = None
+_received: str | None = None
 
 
 def handle_signals() -> None:
-    """Let the first signal end the program in order, also where a script's background has it ignored.
-
-    Later signals find the end under way and change nothing: arms are being stopped and data written.
-    """
+    """Let signals end the program in order, also where a script's background has them ignored."""
     for number in _SIGNALS:
         signal.signal(number, _on_signal)
 
@@ -38,38 +75,32 @@ def ignore_signals() -> None:
 
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
-    global _ending  # noqa: PLW0603 - signals are the process's own
-    if _ending:
-        return
-    _ending = True
-    ignore_signals()
-    reason = f"interrupted by {signal.Signals(number).name}"
-    if _requests is not None:
-        # Of all ways to tell another thread, this one alone may be used where a handler may have interrupted itself.
-        _requests.put(reason)
+    global _received  # noqa: PLW0603 - signals are the process's own
+    _received = _received or f"interrupted by {signal.Signals(number).name}"
+    if _deferred is not None:
+        _deferred.request(_received)
     else:
-        raise Interrupted(reason)
+        raise _Break
 
 
 @contextmanager
-def aborting_with(abort: Callable[[str], None]) -> Iterator[None]:
-    """While a run is on, a signal asks it to end, instead of breaking in wherever the program is."""
-    global _requests  # noqa: PLW0603 - signals are the process's own
-    requests: SimpleQueue[str | None] = SimpleQueue()
-
-    def pass_on() -> None:
-        while (reason := requests.get()) is not None:
-            abort(reason)
-
-    thread = threading.Thread(target=pass_on, name="signals", daemon=True)
-    thread.start()
-    _requests = requests
+def signals_deferred() -> Iterator[DeferredSignals]:
+    """While this lasts signals break in nowhere; at its end Interrupted is raised if one came, and nothing else was."""
+    global _deferred  # noqa: PLW0603 - signals are the process's own
+    signals = DeferredSignals()
+    _deferred = signals
     try:
-        yield
+        _raise_if_received()
+        yield signals
+        _raise_if_received()
     finally:
-        _requests = None
-        requests.put(None)
-        thread.join()
+        _deferred = None
+        signals.close()
+
+
+def _raise_if_received() -> None:
+    if _received is not None:
+        raise Interrupted(_received)
 
 
 @contextmanager
@@ -77,9 +108,11 @@ def ended_in_order() -> Iterator[None]:
     """Turn what ends a command into a message on standard error and an exit code, never a traceback."""
     try:
         yield
+        # A signal may have fallen where Python lets no exception out, such as a weak reference's callback.
+        _raise_if_received()
         sys.stdout.flush()
-    except Interrupted as error:
-        _end(error, str(error), INTERRUPTED)
+    except _Break as error:
+        _end(error, _received or "", INTERRUPTED)
     except DeviceError as error:
         _end(error, str(error), FAULT)
     except DualcalError as error:
@@ -87,7 +120,7 @@ def ended_in_order() -> Iterator[None]:
     except BrokenPipeError as error:
         # Whoever read our output has gone; nothing is left to say to it.
         _silence_output()
-        raise SystemExit(FAULT) from error
+        raise SystemExit(FAULT if _received is None else INTERRUPTED) from error
     except OSError as error:
         _silence_output()
         what = error.strerror or str(error)
@@ -100,7 +133,8 @@ def _silence_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _end(error: Exception, message: str, code: int) -> None:
-    for line in (*message.splitlines(), *getattr(error, "__notes__", ())):
-        print(f"dualcal: {line}", file=sys.stderr)
-    raise SystemExit(code) from error
+def _end(error: BaseException, message: str, code: int) -> None:
+    with suppress(OSError, ValueError):  # where nobody reads it the exit code still tells
+        for line in (*message.splitlines(), *getattr(error, "__notes__", ())):
+            print(f"dualcal: {line}", file=sys.stderr)
+    raise SystemExit(code if _received is None else INTERRUPTED) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -26,7 +27,7 @@ from procedures.planning.model import CellModel
 from procedures.planning.plan import PLAN_FORMAT, Plan
 from procedures.rehearsal import rehearse
 from procedures.report import draw_summary
-from tools.cli.exits import FAULT, aborting_with
+from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.progress import progress
 from tools.cli.show import show_rehearsal, show_result
 from tools.cli.truth import simulated_truth
@@ -61,16 +62,17 @@ def run_cell(options: RunOptions) -> int:
     _confirm(cell, options.yes)
     started = utc_now()
     session = Session.create(options.out or _unused_folder(started, file.cell.name), file.text)
-    try:
-        with progress(console) as watcher:
-            execute(cell, calibration, session, watcher)
-    except BaseException as error:
+    with signals_deferred() as signals:
         try:
-            _write_captures(file, session, started)
-        except OSError as second:
-            error.add_note(f"captures.json could not be written ({second.strerror}); the journal has them")
-        raise
-    captures = _write_captures(file, session, started)
+            with progress(console) as watcher:
+                execute(cell, calibration, session, watcher, lambda engine: signals.pass_on_to(engine.abort))
+        except BaseException as error:
+            try:
+                _write_captures(file, session, started)
+            except OSError as second:
+                error.add_note(f"captures.json could not be written ({second.strerror}); the journal has them")
+            raise
+        captures = _write_captures(file, session, started)
     result = conclude(file, session, captures)
     show_result(console, file.cell, result, simulated_truth(file), as_json=options.json)
     console.print(f"session: {session.folder}", soft_wrap=True, highlight=False)
@@ -100,13 +102,19 @@ def _write_captures(file: CellFile, session: Session, started: datetime) -> Capt
     return captures
 
 
-def execute(cell: Cell, calibration: Calibration, session: Session, watcher: Observer) -> None:
-    """Run the procedure on the cell's devices, which are closed again on any exit."""
+def execute(
+    cell: Cell,
+    calibration: Calibration,
+    session: Session,
+    watcher: Observer,
+    begun: Callable[[Engine], None] = lambda engine: None,
+) -> None:
+    """Run the procedure on the cell's devices, which are closed again on any exit; ``begun`` gets the engine."""
     try:
         with Observers(watcher) as observers, cell as opened:
             engine = Engine(opened, session, observers)
-            with aborting_with(engine.abort):
-                engine.run(calibration.steps())
+            begun(engine)
+            engine.run(calibration.steps())
     except Exception as error:
         error.add_note(f"what was captured is in {session.folder}")
         raise

@@ -148,8 +148,7 @@ class PosePlanner:
         passive = np.stack([_least_travel(q[k], usable[k]) for k in shown])
         roomy = self._has_room(active, passive, T_P_E)
         self._count("no room for alignment", roomy)
-        candidates = (self._candidate(active[k], passive[k], T_P_E[k], distance) for k in np.flatnonzero(roomy))
-        return [candidate for candidate in candidates if candidate is not None]
+        return [self._candidate(active[k], passive[k], T_P_E[k], distance) for k in np.flatnonzero(roomy)]
 
     def _passive_starts(self, T_P_E: Array, distance: Array) -> tuple[Array, Array, Mask]:
         """Starts (a, m, picks, n) and target poses (a, m, picks, 4, 4) near library postures, and which exist."""
@@ -204,11 +203,8 @@ class PosePlanner:
         room[room] = np.all(own.reshape(-1, each) >= model.margin, axis=1)
         return np.asarray(room)
 
-    def _candidate(self, active: Array, passive: Array, T_P_E: Array, distance: Array) -> _Candidate | None:
+    def _candidate(self, active: Array, passive: Array, T_P_E: Array, distance: Array) -> _Candidate:
         model = self._model
-        if not self._ways.clear(model.passive.name, Posture.of(active, passive[0]), passive[1:]):
-            self.refused["the way between two positions is not clear"] += 1
-            return None
         T_P_T = model.target_in_passive(passive)
         clearance = self._ways.geometry.clearance(active[None], passive, self._belief.T_P_A)
         tilt = np.arccos(np.clip(-T_P_T[:, :3, 2] @ T_P_E[:3, 2], -1.0, 1.0))
@@ -222,18 +218,29 @@ class PosePlanner:
     ) -> tuple[list[PlannedConstraint], Posture]:
         """The best-conditioned choice from the pool that can be visited in some order from ``start``."""
         known = self._known(request.captured)
+        straight: dict[int, bool] = {}
         while True:
             chosen = _most_informative(pool, request.constraints, known)
-            ordered, lost, end = self._order(chosen, start)
+            # Ways cost most to judge: only those of candidates that would be chosen are.
+            straight.update({id(c): self._is_straight(c) for c in chosen if id(c) not in straight})
+            lost, why = [c for c in chosen if not straight[id(c)]], "the way between two positions is not clear"
+            if not lost:
+                ordered, lost, end = self._order(chosen, start)
+                why = "no clear way to the constraint"
             if not lost:
                 break
-            self.refused["no clear way to the constraint"] += len(lost)
+            self.refused[why] += len(lost)
             pool = [candidate for candidate in pool if not any(candidate is other for other in lost)]
             if len(pool) < request.constraints:
                 raise NoPlan(self._refusal(request, len(pool)))
         self._require_turns(ordered, request)
         names = range(request.first_number, request.first_number + len(ordered))
         return [_planned(c, f"{request.use}/{i:02d}", request.use) for i, c in zip(names, ordered, strict=True)], end
+
+    def _is_straight(self, candidate: _Candidate) -> bool:
+        """Whether the passive arm can go straight from each position to the next."""
+        first = Posture.of(candidate.active, candidate.passive[0])
+        return self._ways.clear(self._model.passive.name, first, candidate.passive[1:])
 
     def _order(self, chosen: list[_Candidate], start: Posture) -> tuple[list[_Candidate], list[_Candidate], Posture]:
         """Nearest first in joint space, each with a clear way from the one before; those never reached."""

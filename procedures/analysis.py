@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 
@@ -95,12 +96,14 @@ def _sort_out(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[list
             continue
         rejected.append(Rejected(capture.id, reason))
         thinned.add((capture.use, capture.constraint))
+    left = Counter((capture.use, capture.constraint) for capture in used)
     kept = []
     for capture in used:
         place = capture.use, capture.constraint
-        left = sum((other.use, other.constraint) == place for other in used)
-        if capture.use == "calibration" and place in thinned and left < FEWEST_POSITIONS:
-            rejected.append(Rejected(capture.id, f"only {left} usable positions are left of {capture.constraint}"))
+        if capture.use == "calibration" and place in thinned and left[place] < FEWEST_POSITIONS:
+            rejected.append(
+                Rejected(capture.id, f"only {left[place]} usable positions are left of {capture.constraint}")
+            )
         else:
             kept.append(capture)
     return kept, tuple(rejected)

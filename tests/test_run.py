@@ -47,6 +47,20 @@ def dualcal(*arguments: object):
     return result
 
 
+def lose_the_link_at_move(number, monkeypatch, before=lambda: None):
+    """The motion of that number is not begun: ``before`` happens, then the link is gone."""
+    start, moves = GuardedRobot.start, []
+
+    def lossy(self, path):
+        moves.append(self.name)
+        if len(moves) == number:
+            before()
+            raise LinkLost(self.name, "move", "no answer", "check the cable")
+        return start(self, path)
+
+    monkeypatch.setattr(GuardedRobot, "start", lossy)
+
+
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     """A finished run of the small cell."""
@@ -366,16 +380,7 @@ def test_a_full_disk_ends_the_run_with_the_file_and_the_reason(tmp_path, monkeyp
 
 
 def test_a_session_that_is_gone_does_not_hide_why_the_run_ended(tmp_path, monkeypatch):
-    start, moves = GuardedRobot.start, []
-
-    def lossy(self, path):
-        moves.append(self.name)
-        if len(moves) == 12:
-            (tmp_path / "s").rename(tmp_path / "moved")
-            raise LinkLost(self.name, "move", "no answer", "check the cable")
-        return start(self, path)
-
-    monkeypatch.setattr(GuardedRobot, "start", lossy)
+    lose_the_link_at_move(12, monkeypatch, lambda: (tmp_path / "s").rename(tmp_path / "moved"))
     result = dualcal("run", PAPER, "--out", tmp_path / "s", *sets(*SMALL))
     assert result.exit_code == 1
     assert "check the cable" in result.stderr
@@ -409,15 +414,7 @@ def test_a_dry_run_as_json_is_the_plan():
 
 
 def test_a_lost_link_ends_the_run_with_exit_code_1_and_keeps_what_was_captured(tmp_path, monkeypatch):
-    start, moves = GuardedRobot.start, []
-
-    def lossy(self, path):
-        moves.append(self.name)
-        if len(moves) == 16:
-            raise LinkLost(self.name, "move", "no answer", "check the cable")
-        return start(self, path)
-
-    monkeypatch.setattr(GuardedRobot, "start", lossy)
+    lose_the_link_at_move(16, monkeypatch)
     result = dualcal("run", PAPER, "--out", tmp_path / "s", *sets(*SMALL))
     assert result.exit_code == 1
     assert "check the cable" in result.stderr

@@ -33,10 +33,6 @@ class Session:
         return Session(folder)
 
     @property
-    def cell_path(self) -> Path:
-        return self.folder / "cell.yaml"
-
-    @property
     def captures_path(self) -> Path:
         return self.folder / "captures.json"
 

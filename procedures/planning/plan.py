@@ -118,8 +118,3 @@ def turned_about_two_axes(R: Array) -> float:
     axes = vectors / np.maximum(angles, 1e-12)[:, None]
     sideways = np.linalg.norm(np.cross(axes[:, None], vectors[None]), axis=2)
     return float(np.max(np.minimum(sideways, angles[:, None])))
-
-
-def spread_of_axes(directions: Array) -> float:
-    """Smallest eigenvalue of the mean of z z^T over axis directions (k, 3); 1/3 at best, 0 in one plane."""
-    return float(np.linalg.eigvalsh(directions.T @ directions / len(directions))[0])

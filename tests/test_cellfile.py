@@ -100,6 +100,7 @@ class Options(BaseModel):
 
 class Stub:
     Options = Options
+    simulated = True
 
 
 @pytest.fixture(autouse=True)
@@ -735,3 +736,35 @@ def test_aliases_of_aliases_that_stand_for_more_than_a_memory_holds_are_refused(
     path.write_text("\n".join(levels))
     with pytest.raises(CellFileError, match="more than 100000 values"):
         load_cell(path)
+
+
+# What a cell with real arms must say
+
+
+@pytest.fixture
+def real_arms(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Stub, "simulated", False)
+
+
+@pytest.mark.usefixtures("real_arms")
+def test_a_cell_with_real_arms_must_say_how_wrong_its_nominal_may_be(path: Path) -> None:
+    assert any("nominal.uncertainty: missing key" in problem for problem in refused(path, CELL))
+    given = changed(CELL, "nominal:\n", "nominal:\n  uncertainty: {translation_mm: 50, rotation_deg: 5}\n")
+    uncertainty = load(path, given).cell.nominal.uncertainty
+    assert (uncertainty.translation, uncertainty.rotation) == pytest.approx((0.05, np.radians(5)))
+
+
+@pytest.mark.usefixtures("real_arms")
+def test_a_cell_with_real_arms_takes_its_looks(path: Path) -> None:
+    problems = refused(path, CELL, "procedure.first_looks=0")
+    assert any("only a cell that is simulated goes without looks" in problem for problem in problems)
+
+
+def test_a_stand_off_has_an_entry_a_joint(path: Path) -> None:
+    problems = refused(path, CELL, "procedure.stand_off={active_deg: [0, 0], passive_deg: [0, 0, 60]}")
+    assert [problem for problem in problems if "must have 2 entries, one a joint, has 3" in problem]
+
+
+def test_home_keeps_the_procedures_margin_to_the_limits(path: Path) -> None:
+    problems = refused(path, CELL, "robots.left.limit_margin_deg=[0, 100]")
+    assert [problem for problem in problems if "is less than 100 inside its limits" in problem]

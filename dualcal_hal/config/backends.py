@@ -1,0 +1,39 @@
+"""What the devices are reached through."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+from pydantic import BaseModel, ConfigDict, field_validator, model_validator
+
+from dualcal_hal import registry
+
+
+class BackendEntry(BaseModel):
+    """A backend and its options, which are those of its type."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, use_attribute_docstrings=True)
+
+    type: str
+    """The backend's registered name, for instance simulator."""
+
+    @field_validator("type")
+    @classmethod
+    def _is_registered(cls, value: str) -> str:
+        if value not in registry.backend_names():
+            raise ValueError(f"unknown backend '{value}'; there are: {', '.join(registry.backend_names())}")
+        return value
+
+    @model_validator(mode="after")
+    def _options_fit(self) -> Self:
+        try:
+            backend = registry.backend_class(self.type)
+        except ImportError as error:
+            raise ValueError(f"backend '{self.type}' cannot be imported: {error}") from error
+        backend.Options.model_validate(self.options)
+        return self
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The entry without its type, as written."""
+        return dict(self.model_extra or {})

@@ -62,8 +62,8 @@ class Cell:
             self.active = self._arm(config.active_name, config.active)
             self.passive = self._arm(config.passive_name, config.passive)
             self.camera = self._backends[config.camera.backend].camera(CAMERA_NAME)
-            shapes, T_P_A = CellGeometry.of(config), config.nominal.T_P_A
-            self.guard = CellGuard(self.active.robot, self.passive.robot, shapes, T_P_A, config.procedure.clearance)
+            shapes, nominal = CellGeometry.of(config), config.nominal.placement
+            self.guard = CellGuard(self.active.robot, self.passive.robot, shapes, nominal, config.procedure.clearance)
             self._devices = opening.pop_all()
         return self
 

@@ -121,6 +121,19 @@ class ArmBody:
 
 
 @dataclass(frozen=True, eq=False)
+class Placement:
+    """Where the active arm's base stands in the passive one's, ``T_P_A`` (4, 4), and how wrong that may be.
+
+    The error is T_true = T_P_A exp(xi): its parts are at most ``translation`` (m) and ``rotation`` (rad), turning
+    about the active base's origin.
+    """
+
+    T_P_A: Array
+    translation: float = 0.0
+    rotation: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class CellGeometry:
     """Both arms' bodies."""
 
@@ -144,19 +157,21 @@ class CellGeometry:
             ArmBody(passive.chain, link_capsules(passive.chain, passive.link_radius), plate, cell.floor),
         )
 
-    def between(self, q_a: ArrayLike, q_p: ArrayLike, T_P_A: Array) -> Array:
-        """Least distance (k,) in m between the arms at joint angles (k, n) or (1, n) each."""
+    def between(self, q_a: ArrayLike, q_p: ArrayLike, placement: Placement) -> Array:
+        """Least distance (k,) in m between the arms at joint angles (k, n) or (1, n), whatever the bases' error."""
         active = self.active.segments(np.atleast_2d(np.asarray(q_a, dtype=float)))
         passive = self.passive.segments(np.atleast_2d(np.asarray(q_p, dtype=float)))
-        active = apply(T_P_A, active.reshape(-1, 3)).reshape(active.shape)
+        reach = np.linalg.norm(active, axis=3).max(axis=2)
+        active = apply(placement.T_P_A, active.reshape(-1, 3)).reshape(active.shape)
         distance = segment_distance(active[:, :, None], passive[:, None])
+        moved = placement.translation + 2 * np.sin(placement.rotation / 2) * reach
         radii = self.active.capsules.radius[:, None] + self.passive.capsules.radius
-        return np.asarray((distance - radii).min(axis=(1, 2)))
+        return np.asarray((distance - radii - moved[:, :, None]).min(axis=(1, 2)))
 
-    def clearance(self, q_a: ArrayLike, q_p: ArrayLike, T_P_A: Array) -> Array:
+    def clearance(self, q_a: ArrayLike, q_p: ArrayLike, placement: Placement) -> Array:
         """Least of all distances (k,) in m: between the arms, to the floor, of each arm to itself."""
         own = np.minimum(self.active.own_clearance(q_a), self.passive.own_clearance(q_p))
-        return np.minimum(self.between(q_a, q_p, T_P_A), own)
+        return np.minimum(self.between(q_a, q_p, placement), own)
 
 
 def segment_distance(first: Array, second: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dualcal_hal.clock import Clock
 from dualcal_hal.errors import CommandRefused
-from dualcal_hal.geometry import CellGeometry, interpolate
+from dualcal_hal.geometry import CellGeometry, Placement, interpolate
 from dualcal_hal.robot import JointPath, Mode, Motion, MotionState, Robot, RobotState, StopResult
 from dualcal_hal.transforms import Array
 
@@ -51,25 +51,30 @@ class CellGuard:
     """
 
     def __init__(
-        self, active: GuardedRobot, passive: GuardedRobot, geometry: CellGeometry, T_P_A: Array, clearance: float
+        self,
+        active: GuardedRobot,
+        passive: GuardedRobot,
+        geometry: CellGeometry,
+        placement: Placement,
+        clearance: float,
     ) -> None:
         self._active, self._passive = active, passive
         self._geometry = geometry
-        self._T_P_A = T_P_A
+        self._placement = placement
         self._clearance = clearance * PLANNERS_SHARE
         one_at_a_time = threading.Lock()
         active.admit(self._check_active, one_at_a_time)
         passive.admit(self._check_passive, one_at_a_time)
 
-    def place(self, T_P_A: Array) -> None:
-        """Judge clearance with the bases at this ``T_P_A`` (4, 4) from here on; before, it is the nominal one."""
-        self._T_P_A = T_P_A
+    def place(self, placement: Placement) -> None:
+        """Judge clearance with the bases there from here on; before, it is the nominal placement."""
+        self._placement = placement
 
     def _check_active(self, path: Array) -> None:
         other = self._standing(self._passive)
         self._require(
             self._active.name,
-            self._geometry.between(path, [other.positions], self._T_P_A),
+            self._geometry.between(path, [other.positions], self._placement),
             self._geometry.active.own_clearance(path),
         )
 
@@ -77,7 +82,7 @@ class CellGuard:
         other = self._standing(self._active)
         self._require(
             self._passive.name,
-            self._geometry.between([other.positions], path, self._T_P_A),
+            self._geometry.between([other.positions], path, self._placement),
             self._geometry.passive.own_clearance(path),
         )
 

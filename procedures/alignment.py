@@ -242,7 +242,7 @@ class Aligner:
         if way is None:
             return "no clear way"
         for leg in way:
-            yield from move(leg.arm, leg.goal)
+            yield from move(leg.arm, *leg.waypoints)
         return ""
 
     def _lateral(self, sighting: Sighting, seen: Detection) -> tuple[Array, Servo]:

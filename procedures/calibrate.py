@@ -121,7 +121,7 @@ class Calibration:
         self._detector = Detector(model.board, model.intrinsics.size)
         self._arrivals_px: list[Array] = []
         tolerance_px(model, cell.procedure.tolerance_px)
-        self._belief = model.nominal
+        self._belief = model.nominal if cell.procedure.first_looks else model.nominal.taken_as_exact()
         self._views: list[View] = []
         self._retreats: list[Posture] = [model.home]
         self._ways = WayFinder(model, self._belief, self._retreats)
@@ -310,7 +310,7 @@ class Calibration:
     def _adopt(self, belief: Belief) -> Procedure[None]:
         self._belief = belief
         self._ways = WayFinder(self._model, belief, self._retreats)
-        yield Believe(belief.T_P_A)
+        yield Believe(belief.placement)
 
     def _here(self) -> Procedure[Posture]:
         readings = yield from read()
@@ -323,7 +323,7 @@ class Calibration:
         """Move both arms to a posture; says whether there was a clear way."""
         way = self._ways.find((yield from self._here()), goal)
         for leg in way or ():
-            yield from move(leg.arm, leg.goal)
+            yield from move(leg.arm, *leg.waypoints)
         return way is not None
 
     def _go_home(self) -> Procedure[None]:

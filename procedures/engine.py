@@ -85,8 +85,8 @@ class Engine:
         match step:
             case Read():
                 return Readings(self._reading(self._cell.active), self._reading(self._cell.passive))
-            case Move(arm, goal):
-                return self._move(self._cell.arm(arm), goal)
+            case Move(arm, waypoints):
+                return self._move(self._cell.arm(arm), waypoints)
             case Look():
                 return self._look()
             case Task():
@@ -97,8 +97,8 @@ class Engine:
                 return self._session.write_image(name, image)
             case KeepDocument(file_name, document):
                 return self._session.write_document(file_name, document)
-            case Believe(T_P_A):
-                return self._cell.guard.place(T_P_A)
+            case Believe(placement):
+                return self._cell.guard.place(placement)
         raise TypeError(f"{step!r} is no step")
 
     def _task(self, task: Task) -> Any:
@@ -112,15 +112,16 @@ class Engine:
     def _reading(self, arm: Arm) -> ArmReading:
         return ArmReading(arm.robot.read(READ_TIMEOUT), self._commanded.get(arm.robot.name))
 
-    def _move(self, arm: Arm, goal: Joints) -> RobotState:
+    def _move(self, arm: Arm, waypoints: tuple[Joints, ...]) -> RobotState:
         limits = arm.limits
-        path = JointPath((goal,), tuple(map(float, limits.speed)), tuple(map(float, limits.acceleration)))
+        path = JointPath(waypoints, tuple(map(float, limits.speed)), tuple(map(float, limits.acceleration)))
         start = arm.robot.read(READ_TIMEOUT)
-        needed = np.abs(np.subtract(goal, start.positions)) / limits.speed + limits.speed / limits.acceleration
+        ways = np.abs(np.diff([start.positions, *waypoints], axis=0))
+        needed = np.max(ways / limits.speed + limits.speed / limits.acceleration, axis=1).sum()
         # Known as moved before the command leaves: a failure from here on finds the arm among those to stop.
         self._commanded.pop(arm.robot.name, None)
-        self._commanded[arm.robot.name] = goal
-        state = self._wait(arm.robot.start(path), LATE_FACTOR * float(np.max(needed)) + LATE_MARGIN)
+        self._commanded[arm.robot.name] = waypoints[-1]
+        state = self._wait(arm.robot.start(path), LATE_FACTOR * float(needed) + LATE_MARGIN)
         return state
 
     def _wait(self, motion: Motion, timeout: float) -> RobotState:

@@ -39,6 +39,8 @@ def rehearse(cell: CellConfig, model: CellModel) -> Rehearsal:
     Raises NoPlan if there is no stand-off or no posture for a look, and where a cell that takes no looks has no plan.
     """
     belief, start = model.nominal, model.home
+    if not cell.procedure.first_looks:
+        belief = belief.taken_as_exact()
     ways = WayFinder(model, belief, [model.home])
     stand_off: StandOff | None = None
     looks: tuple[RehearsedLook, ...] = ()

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol, Self, TypeVar
 
 from dualcal_hal.camera import Frame, Image
+from dualcal_hal.geometry import Placement
 from dualcal_hal.robot import Joints, RobotState
 from dualcal_hal.session.journal import StepKey
-from dualcal_hal.transforms import Array
 
 T = TypeVar("T")
 Procedure = Generator[Any, Any, T]
@@ -64,10 +64,10 @@ class Read:
 
 @dataclass(frozen=True)
 class Move:
-    """Move one arm straight in joint space to ``goal`` (rad) and wait until it has settled."""
+    """Move one arm straight in joint space through ``waypoints`` (rad) and wait until it has settled."""
 
     arm: str
-    goal: Joints
+    waypoints: tuple[Joints, ...]
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,9 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Believe:
-    """From here on the guard judges clearance with the arms' bases at this ``T_P_A`` (4, 4)."""
+    """From here on the guard judges clearance with the arms' bases placed so."""
 
-    T_P_A: Array
+    placement: Placement
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +123,9 @@ def read() -> Procedure[Readings]:
     return reply
 
 
-def move(arm: str, goal: Joints) -> Procedure[RobotState]:
-    """Move an arm to ``goal`` (rad); the state in which it has settled."""
-    reply: RobotState = yield Move(arm, goal)
+def move(arm: str, *waypoints: Joints) -> Procedure[RobotState]:
+    """Move an arm through ``waypoints`` (rad) to the last of them; the state in which it has settled."""
+    reply: RobotState = yield Move(arm, waypoints)
     return reply
 
 

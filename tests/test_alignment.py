@@ -162,7 +162,7 @@ class Cell:
         match step:
             case Read():
                 return Readings(*(ArmReading(self.state(q), q) for q in self.at.values()))
-            case Move(arm, goal):
+            case Move(arm, (goal,)):
                 self.moves.append(arm)
                 self.at[arm] = goal
                 return self.state(goal)
@@ -187,7 +187,7 @@ def turned(belief, base=(0, 0, 0), camera=(0, 0, 0), shift=(0, 0, 0)):
     """A belief with its base turned and shifted and its camera turned, by rotation vectors in rad and m."""
     base_error, camera_error = transform(rotation_from_vector(base), shift), rotation_from_vector(camera)
     T_H_E = belief.T_H_E @ transform(camera_error, [0, 0, 0])
-    return Belief(belief.T_P_A @ base_error, T_H_E, belief.covariance, "a test")
+    return Belief(belief.T_P_A @ base_error, T_H_E, belief.covariance, "a test", belief.placement)
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +222,7 @@ def test_a_point_off_the_axis_is_brought_onto_it_by_the_passive_arm_alone(model,
 
 def sure(belief):
     """The same belief, held with more confidence than a picture can shake."""
-    return Belief(belief.T_P_A, belief.T_H_E, belief.covariance * 1e-8, "a test")
+    return Belief(belief.T_P_A, belief.T_H_E, belief.covariance * 1e-8, "a test", belief.placement)
 
 
 ROLL = 0.55  # rad; without corrections to the Jacobian an offset would shrink by half with each picture

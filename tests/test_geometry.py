@@ -15,6 +15,7 @@ from dualcal_hal.geometry import (
     LARGEST_STEP,
     ArmBody,
     CellGeometry,
+    Placement,
     camera_capsule,
     interpolate,
     link_capsules,
@@ -89,14 +90,16 @@ def test_clearance_is_the_least_of_arms_floor_and_self():
     geometry = bodies()
     rng = np.random.default_rng(5)
     q_a, q_p = rng.uniform(-1, 1, (2, 20, 6))
-    clearance = geometry.clearance(q_a, q_p, NOMINAL_T_P_A)
+    clearance = geometry.clearance(q_a, q_p, Placement(NOMINAL_T_P_A))
     parts = [
-        geometry.between(q_a, q_p, NOMINAL_T_P_A),
+        geometry.between(q_a, q_p, Placement(NOMINAL_T_P_A)),
         geometry.active.own_clearance(q_a),
         geometry.passive.own_clearance(q_p),
     ]
     np.testing.assert_array_equal(clearance, np.min(parts, axis=0))
-    one_by_one = [geometry.clearance(a[None], p[None], NOMINAL_T_P_A)[0] for a, p in zip(q_a, q_p, strict=True)]
+    one_by_one = [
+        geometry.clearance(a[None], p[None], Placement(NOMINAL_T_P_A))[0] for a, p in zip(q_a, q_p, strict=True)
+    ]
     np.testing.assert_allclose(clearance, one_by_one, atol=1e-12)
 
 
@@ -105,7 +108,7 @@ def test_arms_far_apart_are_further_apart():
     far = NOMINAL_T_P_A.copy()
     far[0, 3] += 1.0
     q = np.zeros((1, 6))
-    assert geometry.between(q, q, far)[0] > geometry.between(q, q, NOMINAL_T_P_A)[0] + 0.5
+    assert geometry.between(q, q, Placement(far))[0] > geometry.between(q, q, Placement(NOMINAL_T_P_A))[0] + 0.5
 
 
 def test_an_arm_that_reaches_down_meets_the_floor_only_where_there_is_one():

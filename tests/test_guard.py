@@ -10,6 +10,7 @@ import pytest
 from dualcal_hal.cell import Cell
 from dualcal_hal.clock import VirtualClock
 from dualcal_hal.errors import CommandRefused
+from dualcal_hal.geometry import Placement
 from dualcal_hal.guard import PLANNERS_SHARE, GuardedRobot, JointLimits
 from dualcal_hal.robot import JointPath, Mode, Motion, Robot, RobotState, StopResult
 from procedures.planning.model import CellModel
@@ -178,7 +179,7 @@ def test_where_the_other_arm_stands_follows_from_the_transforms_believed_now(cel
     model = CellModel(paper_cell().cell)
     far = model.nominal.T_P_A.copy()
     far[0, 3] += 1.0
-    cell.guard.place(far)
+    cell.guard.place(Placement(far))
     cell.passive.robot.start(full_speed(cell.passive, REACHING)).wait(20)
 
 
@@ -215,7 +216,7 @@ def test_the_guard_insists_on_a_part_of_the_planners_clearance(cell):
     assert 0 < PLANNERS_SHARE < 1
     geometry = CellModel(paper_cell().cell).geometry
     cell.active.robot.start(full_speed(cell.active, (0.0, -0.75, 0.2, 0.0, 0.6, 0.0))).wait(20)
-    T_P_A = CellModel(paper_cell().cell).nominal.T_P_A
+    T_P_A = Placement(CellModel(paper_cell().cell).nominal.T_P_A)
     allowed = refused = None
     for bend in np.linspace(0.0, -1.2, 240):
         goal = (0.0, float(bend), 0.2, 0.0, 0.6, 0.0)

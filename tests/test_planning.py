@@ -56,7 +56,7 @@ def clear_of_everything(model, path_a, path_p, belief):
     """An independent walk: finer steps than the planner's, one configuration after the other."""
     geometry = model.geometry
     return min(
-        float(geometry.clearance(a[None], p[None], belief.T_P_A)[0]) for a, p in zip(path_a, path_p, strict=True)
+        float(geometry.clearance(a[None], p[None], belief.placement)[0]) for a, p in zip(path_a, path_p, strict=True)
     )
 
 
@@ -183,7 +183,7 @@ def test_the_passive_arm_has_room_to_move_each_way_in_the_camera_plane(model, pl
                 flange = goal @ inverse(model.T_F_T)
                 q, reached = arm.chain.inverse(flange, [position.passive], arm.lower, arm.upper)
                 assert reached[0]
-                assert model.geometry.clearance([constraint.active], q, model.nominal.T_P_A)[0] > 0.02
+                assert model.geometry.clearance([constraint.active], q, model.nominal.placement)[0] > 0.02
 
 
 def test_flanges_are_turned_about_two_axes(model, plan):
@@ -208,7 +208,7 @@ def test_between_the_positions_of_a_constraint_the_passive_arm_goes_straight(mod
     for constraint in plan.constraints:
         for one, other in itertools.pairwise(constraint.positions):
             posture = Posture(constraint.active, one.passive)
-            path_a, path_p, _ = walk(model, posture, [Leg(model.passive.name, other.passive)])
+            path_a, path_p, _ = walk(model, posture, [Leg(model.passive.name, (other.passive,))])
             assert clear_of_everything(model, path_a, path_p, model.nominal) > model.margin - 0.0013
 
 
@@ -280,7 +280,7 @@ def test_no_way_leads_through_the_other_arm(model):
     reaching = (0.0, -1.2, 0.8, 0.0, 0.0, 0.0)
     touching = Posture.of(reaching, reaching)
     geometry = model.geometry
-    assert geometry.between([reaching], [reaching], model.nominal.T_P_A)[0] < 0
+    assert geometry.between([reaching], [reaching], model.nominal.placement)[0] < 0
     assert WayFinder(model, model.nominal, []).find(model.home, touching) is None
     apart = model.nominal.T_P_A.copy()
     apart[0, 3] += 1.0
@@ -293,7 +293,7 @@ def test_an_arm_at_its_goal_is_not_moved(model, plan):
     constraint = plan.constraints[0]
     start = Posture(constraint.active, constraint.positions[0].passive)
     goal = Posture(constraint.active, constraint.positions[1].passive)
-    assert ways.find(start, goal) == (Leg(model.passive.name, goal.passive),)
+    assert ways.find(start, goal) == (Leg(model.passive.name, (goal.passive,)),)
     assert ways.find(start, start) == ()
 
 
@@ -302,7 +302,7 @@ def test_an_arm_that_stands_too_close_may_leave(model):
     geometry = model.geometry
     for bend in np.linspace(0.0, -1.2, 200):
         q_p = np.array([0.0, bend, 0.2, 0.0, 0.6, 0.0])
-        clearance = geometry.clearance([q_a], [q_p], model.nominal.T_P_A)[0]
+        clearance = geometry.clearance([q_a], [q_p], model.nominal.placement)[0]
         if 0 < clearance < model.margin:
             break
     else:

@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from backends.simulator.noise import generator, normal_image
-from backends.simulator.rendering import BLACK, WHITE, Renderer, undistorted_rays
+from backends.simulator.optics import undistorted_rays
+from backends.simulator.rendering import BLACK, WHITE, Renderer
 from dualcal_hal.camera import Intrinsics
 from dualcal_hal.errors import UsageError
 from dualcal_hal.target import Checkerboard

@@ -17,7 +17,7 @@ from procedures.report import error_table, mismatch_table, outcome, plan_table, 
 from tests.reference_cell import NOMINAL_T_H_E, NOMINAL_T_P_A, T_H_E
 from tests.reference_run import TRUTH, captures, cell, plan, result
 
-FAR = [Leg("left", (-3.0, -2.0, -2.1, -3.2, -2.1, -6.1)), Leg("right", (0.0,) * 6)]
+FAR = [Leg("left", ((-3.0, -2.0, -2.1, -3.2, -2.1, -6.1),)), Leg("right", ((0.0,) * 6,))]
 MINE = cell().model_copy(update={"name": "mine"})
 
 
@@ -203,14 +203,14 @@ def test_a_provisional_plan_is_marked_so() -> None:
 
 
 def test_a_way_shows_its_moves_in_order_with_joints_in_degrees() -> None:
-    legs = [Leg("left", (0.1, -0.2, 0.3, 0, 0.5, np.pi)), Leg("right", (-1.0, 0, 0, 0, 0, 0))]
+    legs = [Leg("left", ((0.1, -0.2, 0.3, 0, 0.5, np.pi),)), Leg("right", ((-1.0, 0, 0, 0, 0, 0),))]
     text = printed(way_table(legs))
     assert row(text, "1") == ["left", "5.7", "-11.5", "17.2", "0.0", "28.6", "180.0"]
     assert row(text, "2") == ["right", "-57.3", "0.0", "0.0", "0.0", "0.0", "0.0"]
 
 
 def test_an_arm_named_in_brackets_keeps_its_name() -> None:
-    assert "[bold]" in printed(way_table([Leg("[bold]", (0.0,) * 6)]))
+    assert "[bold]" in printed(way_table([Leg("[bold]", ((0.0,) * 6,))]))
 
 
 # -- where it is shown -------------------------------------------------------------------------------------------------

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from backends.simulator.noise import normal_image
-from backends.simulator.rendering import Renderer, Values
+from backends.simulator.pattern import Values
+from backends.simulator.rendering import Renderer
 from backends.simulator.world import World
 from dualcal_hal.camera import Camera, Frame, Image
 from dualcal_hal.errors import CommandRefused, DeviceTimeout, NotOpen

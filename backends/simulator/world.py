@@ -11,9 +11,10 @@ import numpy as np
 from backends.simulator.arm import SimulatedArm
 from backends.simulator.noise import generator
 from backends.simulator.stepper import STEPPERS
+from backends.simulator.truth import Truth
 from dualcal_hal.clock import Clock
 from dualcal_hal.robot import Joints
-from dualcal_hal.transforms import Array, inverse
+from dualcal_hal.transforms import Array
 
 if TYPE_CHECKING:
     from dualcal_hal.config import CellConfig, SimulationConfig
@@ -30,9 +31,8 @@ class World:
         self.noise = simulation.noise
         self.lock = threading.RLock()
         self.closed = threading.Event()
-        self._cell = cell
-        self._truth = simulation.truth
-        self._chains = simulation.truth.chains(cell)
+        self._active, self._passive = cell.active_name, cell.passive_name
+        self.truth = Truth(cell, simulation)
         self._seed = simulation.seed
         self.stepper = STEPPERS[simulation.stepper]
         self._samples: Counter[tuple[str, str]] = Counter()
@@ -40,13 +40,9 @@ class World:
 
     def T_E_T(self, when: float) -> Array:
         """(4, 4): the target in the camera at time ``when``, by the true transforms, chains and joint angles."""
-        active, passive = self._cell.active_name, self._cell.passive_name
         with self.lock:
-            T_A_H = self._chains[active].forward(self.arms[active].true_positions(when))
-            T_P_F = self._chains[passive].forward(self.arms[passive].true_positions(when))
-        T_P_E = self._truth.T_P_A @ T_A_H @ self._truth.T_H_E
-        T_P_T = T_P_F @ self._cell.passive.target_mount_transform
-        return inverse(T_P_E) @ T_P_T
+            q_a, q_p = (self.arms[name].true_positions(when) for name in (self._active, self._passive))
+        return self.truth.T_E_T(q_a, q_p)
 
     def joint_error(self, arm: str, target: Joints) -> Array:
         """(n,) rad that the encoders do not see, of an arm that was sent to ``target``: always the same."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualcal_hal.config.values import NotNegative, Section, TransformConfig
+from dualcal_hal.geometry import Placement
 from dualcal_hal.transforms import Array
 
 
@@ -52,3 +53,8 @@ class NominalConfig(TransformsConfig):
     uncertainty: UncertaintyConfig = UncertaintyConfig(translation_mm=120.0, rotation_deg=12.0)
     """Of active_base_in_passive_base: paths before the first look are clear whatever the error within it. Must be given
     on a cell that is not simulated."""
+
+    @property
+    def placement(self) -> Placement:
+        """The active base in the passive one, with its uncertainty."""
+        return Placement(self.T_P_A, self.uncertainty.translation, self.uncertainty.rotation)

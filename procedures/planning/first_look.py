@@ -70,7 +70,7 @@ def find_stand_off(model: CellModel, belief: Belief, ways: WayFinder, start: Pos
         posture = Posture.of(q_a[i], q_p[j])
         way = ways.find(start, posture)
         if way is not None:
-            clearance = float(ways.geometry.between([q_a[i]], [q_p[j]], belief.T_P_A)[0])
+            clearance = float(ways.geometry.between([q_a[i]], [q_p[j]], belief.placement)[0])
             T_E_T = inverse(model.camera_in_passive(q_a[i], belief)) @ model.target_in_passive(q_p[j])
             return StandOff(posture, way, clearance, float(T_E_T[2, 3]))
     raise NoPlan(
@@ -117,7 +117,7 @@ def _posture(model: CellModel, belief: Belief, T_P_E: Array, T_P_T: Array, near:
 
 
 def _is_clear(model: CellModel, belief: Belief, ways: WayFinder, posture: Posture) -> bool:
-    clearance = ways.geometry.clearance([posture.active], [posture.passive], belief.T_P_A)
+    clearance = ways.geometry.clearance([posture.active], [posture.passive], belief.placement)
     return bool(clearance[0] >= model.margin)
 
 
@@ -170,7 +170,7 @@ def _by_merit(model: CellModel, belief: Belief, ways: WayFinder, q_a: Array, q_p
     if not pairs:
         return iter(())
     first, second = np.array(pairs).T
-    between = ways.geometry.between(q_a[first], q_p[second], belief.T_P_A)
+    between = ways.geometry.between(q_a[first], q_p[second], belief.placement)
     T_E_T = inverse(model.camera_in_passive(q_a[first], belief)) @ model.target_in_passive(q_p[second])
     merit = merit_a[first] + merit_p[second] + 4 * np.minimum(between, STAND_OFF_CLEARANCE)
     merit = merit - np.abs(T_E_T[:, 2, 3] - _GOOD_DISTANCE)

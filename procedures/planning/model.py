@@ -17,9 +17,6 @@ from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.estimation.projection import project
 from procedures.planning.belief import Belief
 
-LIMIT_MARGIN = np.deg2rad(3.0)
-"""Poses keep this far (rad) inside the arm's own limits, so that servo moves have room."""
-
 IMAGE_MARGIN = 20.0
 """The whole target stays this far (px) inside the image."""
 
@@ -37,7 +34,7 @@ class ArmModel:
 
     @staticmethod
     def of(name: str, robot: RobotConfig) -> ArmModel:
-        margin = np.minimum(LIMIT_MARGIN, (robot.upper - robot.lower) / 10)
+        margin = robot.limit_margin
         return ArmModel(
             name,
             robot.chain,

@@ -182,7 +182,7 @@ class PosePlanner:
         which = tuple(w[good] for w in which)
         usable = np.zeros(reached.shape, dtype=bool)
         if len(which[0]):
-            between = self._ways.geometry.between(active[which[0]], q[which], self._belief.T_P_A)
+            between = self._ways.geometry.between(active[which[0]], q[which], self._belief.placement)
             self._count("the arms are too close to each other", between >= model.margin)
             usable[tuple(w[between >= model.margin] for w in which)] = True
         return usable
@@ -199,14 +199,14 @@ class PosePlanner:
         room = np.all(reached.reshape(len(active), -1), axis=1)
         each = len(q) // len(active)
         which = np.repeat(room, each)
-        own = self._ways.geometry.clearance(np.repeat(active, each, axis=0)[which], q[which], self._belief.T_P_A)
+        own = self._ways.geometry.clearance(np.repeat(active, each, axis=0)[which], q[which], self._belief.placement)
         room[room] = np.all(own.reshape(-1, each) >= model.margin, axis=1)
         return np.asarray(room)
 
     def _candidate(self, active: Array, passive: Array, T_P_E: Array, distance: Array) -> _Candidate:
         model = self._model
         T_P_T = model.target_in_passive(passive)
-        clearance = self._ways.geometry.clearance(active[None], passive, self._belief.T_P_A)
+        clearance = self._ways.geometry.clearance(active[None], passive, self._belief.placement)
         tilt = np.arccos(np.clip(-T_P_T[:, :3, 2] @ T_P_E[:3, 2], -1.0, 1.0))
         information = _information(T_P_E, self._belief, T_P_T[:, :3, 3])
         return _Candidate(active, passive, tilt, distance, clearance, information)

@@ -11,7 +11,7 @@ from dualcal_hal.robot import Joints
 from dualcal_hal.transforms import Array
 from procedures.detection import board_poses
 from procedures.estimation.corner_fit import Prior, fit_corners
-from procedures.planning.belief import NOMINAL_SIGMA_BASE, NOMINAL_SIGMA_CAMERA, Belief
+from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel
 
 WORST_FIT = 3.0
@@ -41,11 +41,11 @@ def refine(model: CellModel, views: Sequence[View]) -> tuple[Belief, float]:
         corners,
         model.intrinsics.matrix,
         model.intrinsics.distortion,
-        Prior(model.nominal.T_P_A, model.nominal.T_H_E, (*NOMINAL_SIGMA_BASE, *NOMINAL_SIGMA_CAMERA)),
+        Prior(model.nominal.T_P_A, model.nominal.T_H_E, tuple(np.sqrt(np.diag(model.nominal.covariance)[::3]))),
         float(np.hypot(_DETECTION_SIGMA, arrival_scatter(model))),
         [*starts, *([None] * (len(views) - len(starts)))],
     )
-    return Belief(fit.T_P_A, fit.T_H_E, fit.covariance, f"{len(views)} views"), fit.rms
+    return Belief.fitted(fit.T_P_A, fit.T_H_E, fit.covariance, f"{len(views)} views"), fit.rms
 
 
 def arrival_scatter(model: CellModel) -> float:

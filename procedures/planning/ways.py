@@ -10,17 +10,21 @@ from numpy.typing import ArrayLike
 
 from dualcal_hal.geometry import CellGeometry, interpolate
 from dualcal_hal.robot import Joints
-from dualcal_hal.transforms import Array
 from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel, Posture
 
 
 @dataclass(frozen=True)
 class Leg:
-    """One arm's straight move in joint space to ``goal`` (rad) while the other stands."""
+    """One arm's move through ``waypoints`` (rad), straight in joint space from each to the next; the other stands."""
 
     arm: str
-    goal: Joints
+    waypoints: tuple[Joints, ...]
+
+    @property
+    def goal(self) -> Joints:
+        """Where it ends."""
+        return self.waypoints[-1]
 
 
 class WayFinder:
@@ -28,7 +32,7 @@ class WayFinder:
 
     def __init__(self, model: CellModel, belief: Belief, retreats: Iterable[Posture]) -> None:
         self._model = model
-        self._T_P_A: Array = belief.T_P_A
+        self._placement = belief.placement
         self.geometry: CellGeometry = model.geometry
         self._retreats = tuple(retreats)
 
@@ -57,22 +61,22 @@ class WayFinder:
         if arm == self._model.active.name:
             path = interpolate(np.vstack([start.active, waypoints]))
             own = self.geometry.active.own_clearance(path)
-            between = self.geometry.between(path, [start.passive], self._T_P_A)
+            between = self.geometry.between(path, [start.passive], self._placement)
         else:
             path = interpolate(np.vstack([start.passive, waypoints]))
             own = self.geometry.passive.own_clearance(path)
-            between = self.geometry.between([start.active], path, self._T_P_A)
+            between = self.geometry.between([start.active], path, self._placement)
         clearance = np.minimum(own, between)
         # An arm that stands closer than the margin, because the belief has changed, may leave but come no closer.
         return bool(np.all(clearance >= min(self._model.margin, clearance[0])))
 
     def _candidates(self, start: Posture, goal: Posture) -> Iterator[tuple[Leg, ...]]:
         a, p = self._model.active.name, self._model.passive.name
-        to_a, to_p = Leg(a, goal.active), Leg(p, goal.passive)
+        to_a, to_p = Leg(a, (goal.active,)), Leg(p, (goal.passive,))
         yield (to_a, to_p)
         yield (to_p, to_a)
         for retreat in self._retreats:
-            back_a, back_p = Leg(a, retreat.active), Leg(p, retreat.passive)
+            back_a, back_p = Leg(a, (retreat.active,)), Leg(p, (retreat.passive,))
             yield (back_p, to_a, to_p)
             yield (back_a, to_p, to_a)
             yield (back_p, back_a, to_a, to_p)
@@ -81,7 +85,7 @@ class WayFinder:
     def _way_clear(self, start: Posture, way: tuple[Leg, ...]) -> bool:
         posture = start
         for leg in way:
-            if not self.clear(leg.arm, posture, [leg.goal]):
+            if not self.clear(leg.arm, posture, leg.waypoints):
                 return False
             if leg.arm == self._model.active.name:
                 posture = Posture(leg.goal, posture.passive)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, ClassVar, Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from dualcal_hal.camera import Camera
 from dualcal_hal.clock import Clock
@@ -51,3 +52,7 @@ class Backend(ABC):
     @abstractmethod
     def camera(self, name: str) -> Camera:
         """The camera of that name; UnknownDevice if it has none."""
+
+    def documents(self) -> Mapping[str, dict[str, Any]]:
+        """JSON documents that are to be kept beside the run, by file name; asked for while it is open."""
+        return {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from dualcal_hal.backend import Backend
 from dualcal_hal.camera import Camera
@@ -75,6 +75,10 @@ class Cell:
     def arm(self, name: str) -> Arm:
         """The arm of that name in the cell file."""
         return {self.active.robot.name: self.active, self.passive.robot.name: self.passive}[name]
+
+    def documents(self) -> dict[str, dict[str, Any]]:
+        """What the backends want kept beside the run, by file name; asked for while the cell is open."""
+        return {name: document for backend in self._backends.values() for name, document in backend.documents().items()}
 
     @property
     def simulated(self) -> bool:

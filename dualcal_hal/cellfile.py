@@ -24,6 +24,7 @@ from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
 from dualcal_hal.config import CellConfig, CellDocument, Location, SimulationConfig, reference_problems
+from dualcal_hal.config.fixtures import FOLDER, MESHES_ARE_READ
 from dualcal_hal.errors import CellFileError, Problem
 
 
@@ -40,25 +41,27 @@ class CellFile:
     sha256: str
 
 
-def load_cell(path: Path, overrides: Sequence[str] = ()) -> CellFile:
+def load_cell(path: Path, overrides: Sequence[str] = (), *, meshes: bool = True) -> CellFile:
     """Read and check a cell file, with ``overrides`` such as ``procedure.tolerance_px=0.01`` applied.
+
+    ``meshes`` False leaves the files of meshes unread, where no arm is to move: a session has none of them.
 
     An override is a path of keys and list indices, and a YAML scalar or flow value. Raises CellFileError
     with all problems found, each at ``FILE:LINE:COLUMN`` or ``--set PATH``.
     """
     text = _read(path)
     try:
-        return _load(path, text, overrides)
+        return _load(path, text, overrides, {FOLDER: path.parent, MESHES_ARE_READ: meshes})
     except RecursionError as error:
         raise CellFileError([Problem(str(path), "values are nested too deeply, in the file or with --set")]) from error
 
 
-def _load(path: Path, text: str, overrides: Sequence[str]) -> CellFile:
+def _load(path: Path, text: str, overrides: Sequence[str], context: Mapping[str, Any]) -> CellFile:
     source = _Source(str(path), text)
     document = source.document()
-    _, as_written = _checked(document)
+    _, as_written = _checked(document, context)
     settings, refused = _apply(document, overrides)
-    checked, findings = _checked(document)
+    checked, findings = _checked(document, context)
     problems = [*source.key_problems(), *source.cited(findings, as_written, settings)]
     if problems or refused or checked is None:
         raise CellFileError([problem for _, problem in sorted(problems, key=lambda p: p[0])] + refused)
@@ -81,11 +84,11 @@ class _Finding:
     at_key: bool = False
 
 
-def _checked(document: CommentedMap) -> tuple[CellDocument | None, list[_Finding]]:
+def _checked(document: CommentedMap, context: Mapping[str, Any]) -> tuple[CellDocument | None, list[_Finding]]:
     plain = _plain(document)
     findings = [_Finding(*found) for found in reference_problems(plain)]
     try:
-        return CellDocument.model_validate(plain), findings
+        return CellDocument.model_validate(plain, context=dict(context)), findings
     except ValidationError as error:
         return None, findings + _in_words(error)
 

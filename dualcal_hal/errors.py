@@ -15,6 +15,7 @@
         ├── CommandRefused (ValueError)     by the guard or the device, before anything moved
         ├── MotionStopped (RuntimeError)
         ├── MotionFailed (RuntimeError)
+        │   └── Contact                     parts touch that should not
         ├── ArmMoved (RuntimeError)
         └── StopFailed (RuntimeError)
 
@@ -109,6 +110,10 @@ class MotionStopped(DeviceError, RuntimeError):
 
 class MotionFailed(DeviceError, RuntimeError):
     """The motion was ended by a fault before it arrived."""
+
+
+class Contact(MotionFailed):
+    """Parts touch that should not; the message names both."""
 
 
 class ArmMoved(DeviceError, RuntimeError):

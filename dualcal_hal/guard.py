@@ -10,7 +10,7 @@ import numpy as np
 
 from dualcal_hal.clock import Clock
 from dualcal_hal.errors import CommandRefused
-from dualcal_hal.geometry import CellGeometry, Placement, interpolate
+from dualcal_hal.geometry import BETWEEN_SAMPLES, CellGeometry, Placement
 from dualcal_hal.robot import JointPath, Mode, Motion, MotionState, Robot, RobotState, StopResult
 from dualcal_hal.transforms import Array
 
@@ -27,7 +27,10 @@ STANDSTILL = 0.01
 """rad/s below which a joint counts as standing; readings of a resting arm scatter."""
 
 PLANNERS_SHARE = 0.5
-"""Part of the clearance that the guard insists on; the rest is what plans and the reading of joints may differ by."""
+"""Part of the clearance that the guard insists on; the rest is what plans and the reading of joints may differ by.
+
+So a plan that kept the whole of it, for the same placement, is not refused.
+"""
 
 _LIMIT_TOLERANCE = 1e-6  # rad, for what rounding does at a limit
 
@@ -47,7 +50,8 @@ class CellGuard:
 
     Refused with CommandRefused before the first byte: values that are not finite or too many or few, positions
     beyond limits, speeds beyond the arm's, an arm that is not ready or whose state is not fresh, the second of two
-    arms at a time, and paths that come closer than half the clearance to the other arm, the floor or the arm itself.
+    arms at a time, and paths that come closer than half the clearance to the other arm, the floor, a fixture or the arm
+    itself, whatever the error of the bases that the placement allows for.
     """
 
     def __init__(
@@ -70,16 +74,18 @@ class CellGuard:
         """Judge clearance with the bases there from here on; before, it is the nominal placement."""
         self._placement = placement
 
-    def _check_active(self, path: Array) -> None:
+    def _check_active(self, waypoints: Array) -> None:
         other = self._standing(self._passive)
+        path = self._geometry.active.sampled(waypoints)
         self._require(
             self._active.name,
             self._geometry.between(path, [other.positions], self._placement),
             self._geometry.active.own_clearance(path),
         )
 
-    def _check_passive(self, path: Array) -> None:
+    def _check_passive(self, waypoints: Array) -> None:
         other = self._standing(self._active)
+        path = self._geometry.passive.sampled(waypoints)
         self._require(
             self._passive.name,
             self._geometry.between([other.positions], path, self._placement),
@@ -94,7 +100,8 @@ class CellGuard:
         return state
 
     def _require(self, arm: str, between: Array, own: Array) -> None:
-        for clearance, what in ((between, "the other arm"), (own, "the floor or itself")):
+        for at_samples, what in ((between, "the other arm"), (own, "the floor, a fixture or itself")):
+            clearance = at_samples - BETWEEN_SAMPLES
             # An arm that already stands too close to something may move away from that, never closer.
             allowed = min(self._clearance, float(clearance[0]) - 1e-9)
             least = float(np.min(clearance))
@@ -102,7 +109,7 @@ class CellGuard:
                 raise CommandRefused(
                     arm,
                     "move",
-                    f"the path comes within {least * 1e3:.1f} mm of {what}, {allowed * 1e3:.1f} mm are the least",
+                    f"the path may come within {least * 1e3:.1f} mm of {what}, {allowed * 1e3:.1f} mm are the least",
                     "nothing was sent; plan anew or check the nominal transforms in the cell file",
                 )
 
@@ -125,9 +132,10 @@ class GuardedRobot(Robot):
         return self._motion is not None and self._motion.state is MotionState.RUNNING
 
     def admit(self, check: Callable[[Array], None], lock: threading.Lock) -> None:
-        """Let ``check`` judge each sampled path (k, n); without it nothing moves (called by CellGuard).
+        """Let ``check`` judge the waypoints (w, n) of each path, the first where the arm stands (called by CellGuard).
 
-        ``lock`` is held from the judging until the motion has begun, so that no other begins meanwhile.
+        Without it nothing moves. ``lock`` is held from the judging until the motion has begun, so that no other
+        begins meanwhile.
         """
         self._check_cell, self._starting = check, lock
 
@@ -154,7 +162,7 @@ class GuardedRobot(Robot):
         if state.mode is not Mode.READY or state.faults:
             what = ", ".join([f"mode '{state.mode}'", *state.faults])
             raise CommandRefused(self.name, "move", f"the arm is not ready: {what}", "clear it at the controller")
-        check_cell(interpolate([state.positions, *path.waypoints]))
+        check_cell(np.array([state.positions, *path.waypoints]))
         self._motion = self._robot.start(path)
         return self._motion
 

@@ -121,9 +121,9 @@ class Motion:
         """The arm was stopped on the way (called by the backend)."""
         self._end(MotionState.STOPPED, None, MotionStopped(self._device, "move", f"stopped: {reason}"))
 
-    def fail(self, why: str, advice: str = "") -> None:
+    def fail(self, why: str, advice: str = "", kind: type[MotionFailed] = MotionFailed) -> None:
         """A fault ended the motion (called by the backend)."""
-        self._end(MotionState.FAILED, None, MotionFailed(self._device, "move", why, advice))
+        self._end(MotionState.FAILED, None, kind(self._device, "move", why, advice))
 
     def _end(self, state: MotionState, final: RobotState | None, error: DualcalError | None) -> None:
         with self._lock:

@@ -1,4 +1,4 @@
-"""The checkerboard on the passive arm."""
+"""The target on the passive arm."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dualcal_hal.transforms import Array
 
 
 @dataclass(frozen=True)
-class Checkerboard:
+class Target:
     """``rows`` x ``columns`` inner corners, ``square`` in m; ``feature`` is the index of the feature point.
 
     Frame T has its origin in the feature point, x right and y up when looked at from the front, z towards
@@ -44,3 +44,28 @@ class Checkerboard:
         x0, y0 = lowest[:2] - self.square
         x1, y1 = highest[:2] + self.square
         return np.array([[x0, y1, 0.0], [x1, y1, 0.0], [x1, y0, 0.0], [x0, y0, 0.0]])
+
+
+@dataclass(frozen=True)
+class Checkerboard(Target):
+    """Black and white squares; it looks alike in two orientations, or four if it is square."""
+
+
+@dataclass(frozen=True)
+class Charuco(Target):
+    """A checkerboard with an ArUco marker, ``marker`` m wide, in each white square, which tells where it is.
+
+    dictionary: OpenCV's name of the markers' dictionary; white_first: whether the top left square is white and
+    not black, as on boards with an even number of rows of squares printed before OpenCV 4.6.
+    """
+
+    marker: float
+    dictionary: str
+    white_first: bool = False
+
+    @cached_property
+    def marker_squares(self) -> Array:
+        """(markers, 2): column and row of the square that holds each marker, by the marker's id, from the top left."""
+        rows, columns = np.divmod(np.arange((self.rows + 1) * (self.columns + 1)), self.columns + 1)
+        white = (rows + columns) % 2 == (0 if self.white_first else 1)
+        return np.stack([columns[white], rows[white]], axis=1)

@@ -17,7 +17,7 @@ from dualcal_hal.errors import UsageError
 from dualcal_hal.robot import Joints
 from dualcal_hal.transforms import Array, inverse, rotation_angle, transform
 from procedures.analysis import FARTHEST_ALIGNED
-from procedures.detection import Detection, Detector, board_poses
+from procedures.detection import Detection, Detector, Miss, Missed, board_poses
 from procedures.estimation.projection import undistort
 from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel, Posture
@@ -48,6 +48,7 @@ LEAST_ARRIVALS = 8
 LEAST_AUTO_PX = 0.02
 """px; ``auto`` does not go below what the detection of corners resolves."""
 
+_FEATURE_HIDDEN = Missed(Miss.OCCLUDED, "the feature point is not seen; look what is in front of it")
 _POSE_ROTATION_SIGMA = 0.03  # rad; orientation of a small board from one picture
 _WORST_CONDITION = 5.0  # of the Jacobian, in units in which it is near a rotation
 
@@ -211,6 +212,8 @@ class Aligner:
             if picture.detection is None or not (picture.detection.order_known or self._model.board.feature_is_central):
                 return Alignment(Outcome.LOST, frames, reply.offset, picture.reason, arrivals=arrivals)
             sighting, seen = picture.sighting, picture.detection
+            if not np.all(np.isfinite(seen.feature)):
+                return Alignment(Outcome.LOST, frames, reply.offset, str(_FEATURE_HIDDEN), arrivals=arrivals)
             offset = seen.feature - self._model.intrinsics.principal_point
             if last is not None and np.all(np.abs(last[2]) <= SMALL_CORRECTION_PX):
                 arrivals = (*arrivals, offset)

@@ -24,16 +24,16 @@ from procedures.alignment import Aligner, Alignment, AxisTrack, Outcome, point_o
 from procedures.detection import Detector
 from procedures.events import BeliefRefined, ConstraintDone, ConstraintGivenUp, LookTaken, PlanReady, PointDone
 from procedures.planning.belief import Belief
+from procedures.planning.candidates import ROOM
 from procedures.planning.first_look import find_stand_off, look_postures
 from procedures.planning.model import CellModel, Posture
 from procedures.planning.plan import Plan, PlannedConstraint
-from procedures.planning.poses import ROOM, PosePlanner, Request
-from procedures.planning.refine import WORST_FIT, View, arrival_scatter, refine
+from procedures.planning.poses import PosePlanner, Request
+from procedures.planning.refine import LEAST_VIEWS, WORST_FIT, View, arrival_scatter, refine
 from procedures.planning.ways import WayFinder
 from procedures.seeing import see
 from procedures.steps import Believe, KeepDocument, KeepImage, Procedure, move, read, task, tell
 
-LEAST_LOOKS = 3
 _TRIES_A_LOOK = 20
 _REPLACEMENTS = 3
 """Constraints that may be given up, for each that is wanted."""
@@ -121,7 +121,7 @@ class Calibration:
         self._detector = Detector(model.board, model.intrinsics.size)
         self._arrivals_px: list[Array] = []
         tolerance_px(model, cell.procedure.tolerance_px)
-        self._belief = model.nominal if cell.procedure.first_looks else model.nominal.taken_as_exact()
+        self._belief = model.nominal
         self._views: list[View] = []
         self._retreats: list[Posture] = [model.home]
         self._ways = WayFinder(model, self._belief, self._retreats)
@@ -158,9 +158,9 @@ class Calibration:
                 reasons.append(f"look {number + 1}: {record.reason}")
                 if number == 0:
                     break
-        if len(self._views) < LEAST_LOOKS:
+        if len(self._views) < LEAST_VIEWS:
             raise NoPlan(
-                f"first look: {len(self._views)} of {count} looks found the target, {LEAST_LOOKS} are needed "
+                f"first look: {len(self._views)} of {count} looks found the target, {LEAST_VIEWS} are needed "
                 f"({'; '.join(reasons)}); check the nominal transforms, the lighting and that nothing hides the target"
             )
 
@@ -269,7 +269,7 @@ class Calibration:
                 active_joints=sighting.active,
                 passive_joints=sighting.passive,
                 feature=(float(seen.feature[0]), float(seen.feature[1])),
-                corners=tuple((float(u), float(v)) for u, v in seen.corners),
+                corners=_pixels(seen.corners),
                 image_size=self._model.intrinsics.size,
                 aligned=alignment.outcome is Outcome.ALIGNED,
                 order_known=seen.order_known,
@@ -308,6 +308,8 @@ class Calibration:
         yield from tell(BeliefRefined(len(self._views), rms))
 
     def _adopt(self, belief: Belief) -> Procedure[None]:
+        """Go on with a belief; without looks, as simulated cells may, it is always taken as exact."""
+        belief = belief if self._procedure.first_looks else belief.taken_as_exact()
         self._belief = belief
         self._ways = WayFinder(self._model, belief, self._retreats)
         yield Believe(belief.placement)
@@ -381,10 +383,16 @@ def _point_done(constraint: PlannedConstraint, position: int, point: PointRecord
 def _view_record(view: View | None) -> dict[str, Any] | None:
     if view is None:
         return None
-    return {"active_rad": view.active, "passive_rad": view.passive, "corners_px": view.corners.tolist()}
+    return {"active_rad": view.active, "passive_rad": view.passive, "corners_px": _pixels(view.corners)}
 
 
 def _view_from(record: dict[str, Any] | None) -> View | None:
     if record is None:
         return None
-    return View(tuple(record["active_rad"]), tuple(record["passive_rad"]), np.array(record["corners_px"]))
+    corners = np.array([corner or (np.nan, np.nan) for corner in record["corners_px"]])
+    return View(tuple(record["active_rad"]), tuple(record["passive_rad"]), corners)
+
+
+def _pixels(corners: Array) -> tuple[tuple[float, float] | None, ...]:
+    """Corners (n, 2) px as they are recorded: None for one that was not seen."""
+    return tuple((float(u), float(v)) if np.isfinite(u) else None for u, v in corners)

@@ -25,8 +25,12 @@ class RehearsedLook:
 
 @dataclass(frozen=True, eq=False)
 class Rehearsal:
-    """``stand_off`` is None without first looks; ``plan`` is provisional, ``no_plan`` says why there is none."""
+    """``arms``: where they are before the plan begins, at the stand-off or at home.
 
+    ``stand_off`` is None without first looks; ``plan`` is provisional, ``no_plan`` says why there is none.
+    """
+
+    arms: Posture
     stand_off: StandOff | None
     looks: tuple[RehearsedLook, ...]
     plan: Plan | None
@@ -34,7 +38,7 @@ class Rehearsal:
 
 
 def rehearse(cell: CellConfig, model: CellModel) -> Rehearsal:
-    """From ``home``, with the nominal transforms.
+    """From ``home``, with the nominal transforms; the plan as if the looks had found them right.
 
     Raises NoPlan if there is no stand-off or no posture for a look, and where a cell that takes no looks has no plan.
     """
@@ -49,6 +53,9 @@ def rehearse(cell: CellConfig, model: CellModel) -> Rehearsal:
         ways = WayFinder(model, belief, [stand_off.posture, model.home])
         looks = tuple(_looks(model, ways, stand_off.posture, cell.procedure.first_looks))
         start = looks[-1].posture
+        belief = belief.as_if_looked()
+        ways = WayFinder(model, belief, [stand_off.posture, model.home])
+    arms = model.home if stand_off is None else stand_off.posture
     try:
         plan = PosePlanner(model, belief, ways, [cell.procedure.seed, *b"plan"]).plan(
             requests_of(cell.procedure), start, provisional=True
@@ -56,8 +63,8 @@ def rehearse(cell: CellConfig, model: CellModel) -> Rehearsal:
     except NoPlan as refusal:
         if stand_off is None:
             raise
-        return Rehearsal(stand_off, looks, None, str(refusal))
-    return Rehearsal(stand_off, looks, plan, "")
+        return Rehearsal(arms, stand_off, looks, None, str(refusal))
+    return Rehearsal(arms, stand_off, looks, plan, "")
 
 
 def _looks(model: CellModel, ways: WayFinder, stand_off: Posture, count: int) -> Sequence[RehearsedLook]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualcal_hal.errors import ArmMoved
-from procedures.detection import Detection, Detector, Missed
+from procedures.detection import Detection, Detector, Miss, Missed
 from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel
 from procedures.steps import Procedure, Sighting, look
@@ -38,7 +38,8 @@ def see(model: CellModel, detector: Detector, belief: Belief) -> Procedure[Seen]
     predicted = model.predict_corners(sighting.active, sighting.passive, belief)
     found = detector.detect(sighting.frame.image, predicted if np.all(np.isfinite(predicted)) else None)
     if isinstance(found, Missed):
-        return Seen(sighting, None, f"{found.reason}: {found.detail}")
+        return Seen(sighting, None, str(found))
     if not found.order_known:
-        return Seen(sighting, found, "the pattern could be seen from two sides: the order of its corners is not known")
+        unknown = Missed(Miss.AMBIGUOUS_ORDER, "the pattern looks alike from two sides; use charuco")
+        return Seen(sighting, found, str(unknown))
     return Seen(sighting, found)

@@ -55,5 +55,6 @@ def plan() -> Plan:
             PlannedPosition((q[0] + 0.005, *q[1:]), distance=0.5 - 0.02 * i, tilt=0.1 * i, clearance=0.1 - 0.01 * i)
             for i, q in enumerate(member.passive_joints for member in members)
         )
-        constraints.append(PlannedConstraint(name, members[0].use, members[0].active_joints, positions))
-    return Plan(tuple(constraints), {}, False, "5 first looks")
+        use, active = members[0].use, members[0].active_joints
+        constraints.append(PlannedConstraint(name, use, active, positions, 0.0123, 0.35, 6.5))
+    return Plan(tuple(constraints), 0.123, {}, False, "5 first looks")

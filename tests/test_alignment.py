@@ -137,7 +137,7 @@ class Cell:
         self.moves, self.shaken, self.hidden = [], 0, False
 
     def align(self, tolerance=0.1, belief=None, jacobian=None):
-        belief = belief or self.model.nominal
+        belief = belief or self.model.nominal.as_if_looked()
         ways = WayFinder(self.model, belief, [self.model.home])
         detector = Detector(self.model.board, self.model.intrinsics.size)
         self.aligner = aligner = Aligner(self.model, belief, ways, detector, tolerance)
@@ -194,8 +194,9 @@ def turned(belief, base=(0, 0, 0), camera=(0, 0, 0), shift=(0, 0, 0)):
 def plan():
     cell = paper_cell("procedure.constraints=3", "procedure.verification.constraints=0").cell
     model = CellModel(cell)
-    ways = WayFinder(model, model.nominal, [model.home])
-    return PosePlanner(model, model.nominal, ways, [1]).plan(requests_of(cell.procedure), model.home, provisional=False)
+    belief = model.nominal.as_if_looked()
+    ways = WayFinder(model, belief, [model.home])
+    return PosePlanner(model, belief, ways, [1]).plan(requests_of(cell.procedure), model.home, provisional=False)
 
 
 @pytest.fixture
@@ -360,3 +361,25 @@ def test_what_is_left_after_small_corrections_counts_as_an_arrivals_scatter(mode
 
 def test_the_papers_alignment_error_is_its_own():
     assert largest_alignment_error(CellModel(paper_cell().cell), 0.1) == pytest.approx(0.087e-3, abs=0.0005e-3)
+
+
+def test_a_hidden_feature_point_is_lost_though_the_rest_of_the_target_is_seen(plan):
+    charuco = CellModel(
+        paper_cell(
+            "target={kind: charuco, corners: [4, 4], feature_corner: [1, 1], square_mm: 25, marker_mm: 18,"
+            " dictionary: DICT_4X4_50}"
+        ).cell
+    )
+    cell = Cell(charuco, plan, charuco.nominal)
+    assert cell.align().outcome is Outcome.ALIGNED
+    draw = cell.image
+
+    def with_something_in_the_middle():
+        image = draw()
+        image[374:394, 502:522] = 120
+        return image
+
+    cell.image = with_something_in_the_middle
+    found = cell.align()
+    assert found.outcome is Outcome.LOST
+    assert "occluded: the feature point" in found.reason

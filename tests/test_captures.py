@@ -83,6 +83,14 @@ def test_a_record_goes_through_the_journal_unchanged() -> None:
     assert CaptureRecord.from_record(json.loads(json.dumps(entry.to_record()))) == entry
 
 
+def test_corners_that_were_not_seen_are_null_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "captures.json"
+    entry = CaptureRecord.from_record(capture(corners_px=[None, [500.0, 380.0], *[None] * 7]))
+    write_captures(path, Captures("ab", "now", (entry,)))
+    assert json.loads(path.read_text())["captures"][0]["corners_px"][:2] == [None, [500.0, 380.0]]
+    assert read_captures(path, corners=9, feature=0).captures == (entry,)
+
+
 def test_without_arrivals_each_constraint_is_one(write: Callable[..., Path]) -> None:
     entries = [
         without(capture("a", constraint="0"), "active_arrival"),

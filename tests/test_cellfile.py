@@ -417,7 +417,7 @@ BAD = {
         "simulation.truth.kinematics.left.dh: must have 2 entries, as the arm's own, has 1",
     ),
     "an unknown stepper": (
-        "stepper: kinematic", "stepper: magic", "magic", "simulation.stepper: must be 'kinematic', not 'magic'",
+        "stepper: kinematic", "stepper: magic", "magic", "simulation.stepper: must be 'kinematic' or 'bullet', not 'magic'",
     ),
     "a key given twice": (
         "name: small", "name: small\nname: large", "name: large", "name: duplicate key, first in line 2",
@@ -639,11 +639,11 @@ def test_the_schema_bounds_sizes_and_counts() -> None:
 
 
 def test_every_number_in_the_schema_says_what_it_is_with_its_unit() -> None:
-    units = {"mm": "mm", "deg": "degrees", "s": "per second", "mrad": "mrad", "px": "px"}
+    units = {"mm": "mm", "deg": "degrees", "s": "seconds", "deg_s": "degrees per second", "mrad": "mrad", "px": "px"}
     for section in cell_schema()["$defs"].values():
         for key, value in section["properties"].items():
             assert value.get("description") or "$ref" in value, key
-            unit = units.get(key.rpartition("_")[2])
+            unit = next((unit for tail, unit in reversed(units.items()) if key.endswith(f"_{tail}")), None)
             assert unit is None or "$ref" in value or unit in value["description"], key
 
 

@@ -12,7 +12,8 @@ from dualcal_hal.camera import Image, Intrinsics
 from dualcal_hal.errors import DegenerateCaptures, UsageError
 from dualcal_hal.target import Checkerboard
 from dualcal_hal.transforms import Array, rotation_angle, rotation_from_vector, transform
-from procedures.detection import Detection, Detector, Miss, Missed, board_poses
+from procedures.detection import Detection, Detector, Miss, Missed, board_poses, checkerboard
+from procedures.detection.lattice import SaddlePoints
 from tests.board_images import FACING, Scene, clutter, intrinsics, project, random_view
 
 CAMERA = intrinsics()
@@ -47,10 +48,10 @@ def rolled(pixels: Array, roll: float, scale: float = 1.0, shift: tuple[float, f
     return np.asarray(centre + shift + (pixels - centre) @ turn.T)
 
 
-def errors_over_views(count: int, seed: int) -> Array:
+def errors_over_views(count: int, seed: int, blur: float = 0.6, noise: float = 2.0) -> Array:
     """(9 count, 2) px: detected minus true corners over random distorted views."""
     rng = np.random.default_rng(seed)
-    scene, detector = Scene(BOARD, CAMERA, rng), Detector(BOARD, CAMERA.size)
+    scene, detector = Scene(BOARD, CAMERA, rng, blur, noise), Detector(BOARD, CAMERA.size)
     errors = []
     for _ in range(count):
         T_E_T = random_view(rng, BOARD, CAMERA)
@@ -71,15 +72,21 @@ def detector() -> Detector:
 
 def test_corners_are_within_a_hundredth_of_a_pixel_of_the_truth() -> None:
     errors = errors_over_views(25, seed=11)
-    assert np.all(np.sqrt(np.mean(errors**2, axis=0)) < 0.012)
+    assert np.all(np.sqrt(np.mean(errors**2, axis=0)) < 0.010)
     assert np.all(np.abs(np.mean(errors, axis=0)) < 0.003)
 
 
 @pytest.mark.slow
-def test_corners_are_within_a_hundredth_of_a_pixel_of_the_truth_over_two_hundred_views() -> None:
-    errors = errors_over_views(200, seed=12)
-    assert np.all(np.sqrt(np.mean(errors**2, axis=0)) < 0.012)
-    assert np.all(np.abs(np.mean(errors, axis=0)) < 0.003)
+@pytest.mark.parametrize(("blur", "noise", "limit"), [(0.6, 2.0, 0.010), (1.5, 10.0, 0.05)])
+def test_corners_are_where_they_should_be_over_five_hundred_views(blur: float, noise: float, limit: float) -> None:
+    errors = errors_over_views(500, 12, blur, noise)
+    assert np.all(np.sqrt(np.mean(errors**2, axis=0)) < limit)
+    assert np.all(np.abs(np.mean(errors, axis=0)) < 0.1 * limit)
+
+
+def test_corners_in_blur_and_noise_are_within_a_twentieth_of_a_pixel() -> None:
+    errors = errors_over_views(15, seed=13, blur=1.5, noise=10.0)
+    assert np.all(np.sqrt(np.mean(errors**2, axis=0)) < 0.05)
 
 
 @pytest.mark.parametrize("board", BOARDS, ids=lambda board: f"{board.rows}x{board.columns}")
@@ -167,13 +174,12 @@ def test_whatever_end_the_search_starts_from_the_result_is_the_same(
 ) -> None:
     image, truth = scene.image(facing(0.3)), project(BOARD, CAMERA, facing(0.3))
     expected = detected(detector.detect(image, truth)).corners
-    find = cv2.findChessboardCorners
+    find = checkerboard.find_lattices
 
-    def from_another_end(image: Image, size: tuple[int, int], flags: int) -> tuple[bool, Array]:
-        found, corners = find(image, size, flags=flags)
-        return found, corners.reshape(3, 3, 2)[flip].reshape(-1, 1, 2)
+    def from_another_end(saddles: SaddlePoints, least: int) -> list[Array]:
+        return [lattice[flip] for lattice in find(saddles, least)]
 
-    monkeypatch.setattr(cv2, "findChessboardCorners", from_another_end)
+    monkeypatch.setattr(checkerboard, "find_lattices", from_another_end)
     np.testing.assert_allclose(detected(detector.detect(image, truth)).corners, expected, atol=0.005)
 
 
@@ -187,13 +193,14 @@ def test_clutter_around_the_board_does_not_matter(scene: Scene, detector: Detect
             np.testing.assert_allclose(detected(detector.detect(image, prediction)).corners, truth, atol=0.2)
 
 
-def test_nothing_is_found_in_a_few_images_of_clutter(detector: Detector) -> None:
-    assert_all_missed(detector, seed=8, count=3)
+def test_nothing_is_found_in_images_of_clutter(detector: Detector) -> None:
+    assert_all_missed(detector, seed=8, count=25)
 
 
 @pytest.mark.slow
-def test_nothing_is_found_in_fifty_images_of_clutter(detector: Detector) -> None:
-    assert_all_missed(detector, seed=9, count=50)
+@pytest.mark.timeout(900)
+def test_nothing_is_found_in_two_thousand_images_of_clutter(detector: Detector) -> None:
+    assert_all_missed(detector, seed=9, count=2000)
 
 
 def assert_all_missed(detector: Detector, seed: int, count: int) -> None:
@@ -206,12 +213,12 @@ def test_corners_that_are_not_a_boards_are_refused_even_if_the_search_returns_th
     detector: Detector, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(10)
-    grid = np.stack(np.meshgrid(np.arange(3), np.arange(3)), axis=-1).reshape(-1, 1, 2)
+    grid = np.stack(np.meshgrid(np.arange(3), np.arange(3)), axis=-1)
 
-    def anything(image: Image, size: tuple[int, int], flags: int) -> tuple[bool, Array]:
-        return True, rng.uniform(100, 500, 2) + rng.uniform(15, 60) * grid + rng.normal(0, 1, (9, 1, 2))
+    def anything(saddles: SaddlePoints, least: int) -> list[Array]:
+        return [rng.uniform(100, 500, 2) + rng.uniform(15, 60) * grid + rng.normal(0, 1, (3, 3, 2))]
 
-    monkeypatch.setattr(cv2, "findChessboardCorners", anything)
+    monkeypatch.setattr(checkerboard, "find_lattices", anything)
     for _ in range(10):
         assert missed(detector.detect(clutter(rng))).reason is Miss.NOT_FOUND
 
@@ -221,20 +228,29 @@ def test_a_grid_of_dark_spots_is_no_checkerboard(detector: Detector, monkeypatch
     for i, j in np.ndindex(5, 5):
         image[300 + 60 * i : 335 + 60 * i, 400 + 60 * j : 435 + 60 * j] = 30
     image = cv2.GaussianBlur(image, (0, 0), 0.6)
-    between = [(477 + 30 * (j + i), 407 + 30 * (i - j)) for i in range(3) for j in range(3)]
-    monkeypatch.setattr(cv2, "findChessboardCorners", lambda image, size, flags: (True, np.array(between, dtype=float)))
+    assert missed(detector.detect(image)).reason is Miss.NOT_FOUND
+    between = np.array([[(477 + 30 * (j + i), 407 + 30 * (i - j)) for i in range(3)] for j in range(3)], dtype=float)
+    monkeypatch.setattr(checkerboard, "find_lattices", lambda saddles, least: [between])
     outcome = missed(detector.detect(image))
     assert outcome.reason is Miss.NOT_FOUND
     assert "meet like squares" in outcome.detail
 
 
-def test_a_larger_checkerboard_is_not_taken_for_a_part_of_it(
+@pytest.mark.parametrize(("rows", "columns"), [(3, 4), (4, 3), (4, 4), (5, 5), (3, 7)])
+def test_a_larger_checkerboard_is_not_taken_for_a_part_of_it(detector: Detector, rows: int, columns: int) -> None:
+    larger = Checkerboard(rows, columns, 0.025, columns + 1)
+    outcome = missed(detector.detect(Scene(larger, CAMERA, np.random.default_rng(11)).image(facing(0.3))))
+    assert outcome.reason is Miss.NOT_FOUND
+    assert "more corners" in outcome.detail
+
+
+def test_a_larger_checkerboard_is_known_by_its_squares_where_its_corners_were_not_seen(
     detector: Detector, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     larger = Checkerboard(5, 5, 0.025, 12)
     image = Scene(larger, CAMERA, np.random.default_rng(11)).image(facing())
-    inner = project(larger, CAMERA, facing()).reshape(5, 5, 2)[1:4, 1:4].reshape(-1, 2)
-    monkeypatch.setattr(cv2, "findChessboardCorners", lambda image, size, flags: (True, inner))
+    inner = project(larger, CAMERA, facing()).reshape(5, 5, 2)[1:4, 1:4]
+    monkeypatch.setattr(checkerboard, "find_lattices", lambda saddles, least: [inner])
     outcome = missed(detector.detect(image))
     assert outcome.reason is Miss.NOT_FOUND
     assert "more corners" in outcome.detail
@@ -282,11 +298,65 @@ def test_an_empty_image_is_a_miss(detector: Detector) -> None:
     assert missed(detector.detect(np.full((768, 1024), 128, np.uint8))).reason is Miss.NOT_FOUND
 
 
-def test_a_hidden_corner_is_a_miss(scene: Scene, detector: Detector) -> None:
+@pytest.mark.parametrize("corner", range(9))
+def test_a_hidden_corner_means_occluded(scene: Scene, detector: Detector, corner: int) -> None:
+    truth = project(BOARD, CAMERA, facing())
+    image = covered(scene.image(facing()), truth[corner], 120)
+    outcome = missed(detector.detect(image, truth + np.array([15.0, -10.0])))
+    assert outcome.reason is Miss.OCCLUDED
+    assert "8 of 9 corners" in outcome.detail
+    assert "in front" in outcome.detail
+
+
+def test_something_in_front_of_a_third_of_the_board_means_occluded(scene: Scene, detector: Detector) -> None:
     image, truth = scene.image(facing()), project(BOARD, CAMERA, facing())
-    x, y = np.rint(truth[0]).astype(int)
-    image[y - 15 : y + 15, x - 15 : x + 15] = 120
-    assert missed(detector.detect(image, truth)).reason is Miss.NOT_FOUND
+    image[:, int(truth[2, 0]) - 15 :] = 90
+    assert missed(detector.detect(image, truth)).reason is Miss.OCCLUDED
+
+
+def test_a_corner_in_a_glare_means_saturated(scene: Scene, detector: Detector) -> None:
+    truth = project(BOARD, CAMERA, facing())
+    outcome = missed(detector.detect(covered(scene.image(facing()), truth[4], 255), truth))
+    assert outcome.reason is Miss.SATURATED
+    assert "exposure" in outcome.detail
+
+
+def test_a_corner_in_a_deep_shadow_means_too_dark(scene: Scene, detector: Detector) -> None:
+    truth = project(BOARD, CAMERA, facing())
+    assert missed(detector.detect(covered(scene.image(facing()), truth[4], 5), truth)).reason is Miss.TOO_DARK
+
+
+@pytest.mark.parametrize("predicted", [True, False])
+@pytest.mark.parametrize(
+    ("gain", "offset", "reason"),
+    [(8.0, 30.0, Miss.SATURATED), (0.1, 0.0, Miss.TOO_DARK), (0.08, 100.0, Miss.NOT_FOUND), (0.5, 20.0, None)],
+)
+def test_an_exposure_that_hides_the_board_is_the_reason(
+    scene: Scene, detector: Detector, gain: float, offset: float, reason: Miss | None, predicted: bool
+) -> None:
+    image = np.clip(gain * scene.image(facing()) + offset, 0, 255).astype(np.uint8)
+    outcome = detector.detect(image, project(BOARD, CAMERA, facing()) if predicted else None)
+    assert (outcome.reason if isinstance(outcome, Missed) else None) is reason
+
+
+def test_the_board_is_found_in_light_from_one_side(scene: Scene, detector: Detector) -> None:
+    truth = project(BOARD, CAMERA, facing(0.4))
+    light = np.linspace(0.1, 1.0, 1024)  # so steep that it shifts the saddles by a tenth of a pixel
+    image = np.rint(scene.image(facing(0.4)) * light).astype(np.uint8)
+    for prediction in (truth, None):
+        np.testing.assert_allclose(detected(detector.detect(image, prediction)).feature, truth[4], atol=0.2)
+
+
+def test_an_image_without_any_sharp_edge_is_blurred(detector: Detector) -> None:
+    image = Scene(BOARD, CAMERA, np.random.default_rng(14), blur=25.0).image(facing(0.5))
+    assert missed(detector.detect(image, project(BOARD, CAMERA, facing(0.5)))).reason is Miss.BLURRED
+
+
+def covered(image: Image, middle: Array, grey: int) -> Image:
+    """The image with a square of one grey value over a corner."""
+    x, y = np.rint(middle).astype(int)
+    image[y - 15 : y + 16, x - 15 : x + 16] = grey
+    return image
 
 
 @pytest.mark.parametrize(
@@ -331,9 +401,19 @@ def test_the_rms_of_a_pose_is_that_of_the_noise_less_what_the_pose_takes_up() ->
     assert np.sqrt(np.mean(squares)) == pytest.approx(0.1 * np.sqrt((18 - 6) / 18), rel=0.1)
 
 
-@pytest.mark.parametrize("corners", [np.zeros((8, 2)), np.full((9, 2), np.inf)])
+def test_a_pose_from_some_of_the_corners_is_the_true_one() -> None:
+    rng = np.random.default_rng(16)
+    T_E_T = random_view(rng, BOARD, CAMERA)
+    corners = project(BOARD, CAMERA, T_E_T)
+    corners[[0, 1, 2, 5]] = np.nan
+    T, rms = board_poses(corners, BOARD, CAMERA)[0]
+    assert rms < 1e-4
+    np.testing.assert_allclose(T, T_E_T, atol=1e-5)
+
+
+@pytest.mark.parametrize("corners", [np.zeros((8, 2)), np.full((9, 2), np.inf), np.full((9, 2), np.nan)])
 def test_a_pose_from_other_than_the_boards_corners_is_a_usage_error(corners: Array) -> None:
-    with pytest.raises(UsageError, match="9 finite corners"):
+    with pytest.raises(UsageError, match="at least 4 are finite"):
         board_poses(corners, BOARD, CAMERA)
 
 

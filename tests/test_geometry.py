@@ -12,18 +12,23 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from dualcal_hal.geometry import (
-    LARGEST_STEP,
+    BETWEEN_SAMPLES,
+    LARGEST_MOTION,
     ArmBody,
+    Capsules,
     CellGeometry,
     Placement,
+    camera_box,
     camera_capsule,
-    interpolate,
     link_capsules,
+    plate_box,
     plate_capsules,
     segment_distance,
 )
+from dualcal_hal.geometry.exact import ExactCell
 from dualcal_hal.target import Checkerboard
-from dualcal_hal.transforms import smallest_rotation
+from dualcal_hal.transforms import apply, rotation_from_vector, smallest_rotation, transform
+from tests.cells import paper_cell
 from tests.reference_cell import ACTIVE, NOMINAL_T_H_E, NOMINAL_T_P_A, PASSIVE, T_F_T
 
 segments = arrays(float, (2, 3), elements=st.floats(-1, 1).map(lambda x: round(x, 3)))
@@ -76,14 +81,29 @@ def test_links_run_from_frame_to_frame():
         assert segment_distance(one, following) < 0.006
 
 
-def test_the_plates_capsules_cover_the_plate():
-    covering = plate_capsules(6, np.eye(4), BOARD.outline)
-    low, high = BOARD.outline.min(axis=0), BOARD.outline.max(axis=0)
-    grid = np.stack(np.meshgrid(*[np.linspace(low[i], high[i], 41) for i in (0, 1)]), axis=-1).reshape(-1, 2)
-    points = np.column_stack([grid, np.zeros(len(grid))])
-    distance = segment_distance(np.stack([points, points], axis=1)[:, None], covering.ends[None])
-    # A round end leaves only the outermost tip of a plate's corner uncovered.
-    assert np.max(np.min(distance, axis=1) - covering.radius[0]) < 0.0075
+def inside(points, capsules):
+    """How deep (n,) points lie inside the nearest of the capsules, m."""
+    distance = segment_distance(np.stack([points, points], axis=1)[:, None], capsules.ends[None])
+    return np.max(capsules.radius - distance, axis=1)
+
+
+def surface(sizes, T, count=41):
+    """Points (n, 3) all over a box."""
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, count)] * 3), axis=-1).reshape(-1, 3)
+    on_it = np.any(np.abs(grid) > 0.5 - 1e-9, axis=1)
+    return apply(T, grid[on_it] * sizes)
+
+
+@pytest.mark.parametrize("board", [BOARD, Checkerboard(5, 8, 0.012, 12), Checkerboard(3, 3, 0.004, 4)])
+def test_the_plates_capsules_contain_the_plate(board):
+    covering = plate_capsules(6, np.eye(4), board.outline)
+    assert np.min(inside(surface(*plate_box(board.outline)), covering)) > -1e-9
+    assert np.max(covering.ends[..., :2] - board.outline.max(axis=0)[:2]) < 0
+
+
+def test_the_cameras_capsule_contains_its_housing():
+    covering = camera_capsule(6, np.eye(4), 0.035, 0.02)
+    assert np.min(inside(surface(*camera_box(0.035, 0.02)), covering)) > -1e-9
 
 
 def test_clearance_is_the_least_of_arms_floor_and_self():
@@ -125,9 +145,184 @@ def test_a_camera_folded_onto_the_forearm_is_too_close():
     assert min(folded) < 0 < straight
 
 
-@given(arrays(float, (3, 6), elements=st.floats(-3, 3)))
-def test_a_path_is_sampled_in_steps_no_larger_than_told_and_passes_its_waypoints(waypoints):
-    samples = interpolate(waypoints)
-    assert np.max(np.abs(np.diff(samples, axis=0)), initial=0.0) <= LARGEST_STEP + 1e-12
-    for waypoint in waypoints:
+# The bases' error
+
+NOTHING = Capsules(np.zeros(0, dtype=np.int64), np.zeros((0, 2, 3)), np.zeros(0))
+HERE = np.zeros((1, 6))
+places = arrays(float, (2, 2, 3), elements=st.floats(-1, 1).map(lambda x: round(x, 3)))
+directions = arrays(float, 3, elements=st.floats(-1, 1)).filter(lambda v: np.linalg.norm(v) > 0.1)
+
+
+def two_capsules(ends):
+    """A cell with one capsule on each base, radii of 50 and 30 mm."""
+    active, passive = (
+        ArmBody(chain, Capsules(np.array([0]), e[None], np.array([r])), NOTHING, None)
+        for chain, e, r in zip((ACTIVE, PASSIVE), ends, (0.05, 0.03), strict=True)
+    )
+    return CellGeometry(active, passive)
+
+
+def moved(translation, rotation):
+    return NOMINAL_T_P_A @ transform(rotation_from_vector(rotation), translation)
+
+
+def of_length(direction, length):
+    return direction / np.linalg.norm(direction) * length
+
+
+@settings(max_examples=300)
+@given(places, directions, directions, st.floats(0, 0.2), st.floats(0, 0.5), st.floats(0, 1), st.floats(0, 1))
+def test_clearance_holds_for_every_error_of_the_bases(ends, along, about, translation, rotation, part, share):
+    geometry = two_capsules(ends)
+    promised = geometry.between(HERE, HERE, Placement(NOMINAL_T_P_A, translation, rotation))[0]
+    true = moved(of_length(along, translation * part), of_length(about, rotation * share))
+    assert geometry.between(HERE, HERE, Placement(true))[0] >= promised - 1e-9
+
+
+@given(places)
+def test_without_an_error_clearance_is_the_distance(ends):
+    geometry = two_capsules(ends)
+    distance = segment_distance(apply(NOMINAL_T_P_A, ends[0]), ends[1])
+    clearance = geometry.between(HERE, HERE, Placement(NOMINAL_T_P_A))[0]
+    if distance > 1e-6:
+        assert clearance == pytest.approx(distance - 0.08, abs=1e-9)
+    else:
+        assert clearance <= -0.08 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("translation", "rotation", "share"), [(0.015, 0.01, 0.98), (0.0, 0.02, 0.98), (0.12, 0.21, 0.75)]
+)
+def test_clearance_gives_away_little_more_than_the_worst_error_takes(translation, rotation, share):
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        ball, post = rng.uniform(-0.6, 0.6, 3), rng.uniform(-0.6, 0.6, 3)
+        ends = np.array([[ball, ball], [post, post]])
+        geometry = two_capsules(ends)
+        from_pivot = apply(np.linalg.inv(NOMINAL_T_P_A), post[None])[0] - ball
+        exact = geometry.between(HERE, HERE, Placement(NOMINAL_T_P_A))[0]
+        turn = np.cross(ball, from_pivot)
+        turned = rotation_from_vector(of_length(turn, rotation)) @ ball
+        true = moved(of_length(from_pivot - (turned - ball), translation), of_length(turn, rotation))
+        worst = geometry.between(HERE, HERE, Placement(true))[0]
+        promised = geometry.between(HERE, HERE, Placement(NOMINAL_T_P_A, translation, rotation))[0]
+        if exact > 0.4:
+            assert share * (exact - promised) - 1e-4 < exact - worst <= exact - promised + 1e-9
+
+
+def one_by_one(active, passive, placement):
+    """Clearance of the closest pair of capsules, all of them on the bases, each pair in a cell of its own."""
+    return min(
+        CellGeometry(
+            ArmBody(ACTIVE, only(active, i), NOTHING, None), ArmBody(PASSIVE, only(passive, j), NOTHING, None)
+        ).between(HERE, HERE, placement)[0]
+        for i, j in itertools.product(range(len(active)), range(len(passive)))
+    )
+
+
+@pytest.mark.parametrize(
+    ("active", "passive", "error"),
+    [
+        # The end of a long capsule, with the middle of a short one closer.
+        ([[[0.0, 0, 0.1], [0.8, 0, 0.1]], [[0.85, 0.1, 0.1]] * 2], [[[0.85, 0, 0.1]] * 2], 0.0),
+        # What the bases' rotation moves far, with what it hardly moves closer.
+        ([[[1.0, 0, 0]] * 2, [[0.01, 0, 0]] * 2], [[[1.0, 0.3, 0]] * 2, [[-0.2, 0, 0]] * 2], 0.2),
+    ],
+)
+def test_the_closest_pair_is_never_passed_over(active, passive, error):
+    T_P_A = np.eye(4)
+    first, second = (
+        Capsules(np.zeros(len(ends), dtype=np.int64), np.array(ends), np.full(len(ends), 0.01))
+        for ends in (active, passive)
+    )
+    together = CellGeometry(ArmBody(ACTIVE, first, NOTHING, None), ArmBody(PASSIVE, second, NOTHING, None))
+    placement = Placement(T_P_A, 0.0, error)
+    clearance = together.between(HERE, HERE, placement)[0]
+    assert clearance == pytest.approx(one_by_one(first, second, placement), abs=1e-12)
+
+
+def only(capsules, index):
+    return Capsules(capsules.frame[[index]], capsules.ends[[index]], capsules.radius[[index]])
+
+
+# Paths
+
+waypoints = arrays(float, (3, 6), elements=st.floats(-3, 3))
+
+
+@settings(deadline=None)
+@given(waypoints)
+def test_no_part_moves_further_than_10_mm_from_one_sample_to_the_next(points):
+    body = bodies().active
+    samples = body.sampled(points)
+    motion = np.linalg.norm(np.diff(body.segments(samples), axis=0), axis=-1)
+    assert np.max(motion, initial=0.0) <= 0.010 == LARGEST_MOTION
+    for waypoint in points:
         assert np.min(np.max(np.abs(samples - waypoint), axis=1)) < 1e-12
+
+
+@settings(deadline=None, max_examples=30)
+@given(waypoints)
+def test_samples_lie_on_the_straight_moves_in_order(points):
+    samples = bodies().active.sampled(points[:2])
+    along = points[1] - points[0]
+    fraction = (samples - points[0]) @ along / max(along @ along, 1e-30)
+    np.testing.assert_allclose(samples, points[0] + fraction[:, None] * along, atol=1e-9)
+    assert np.all(np.diff(fraction) >= 0)
+
+
+@settings(deadline=None, max_examples=50)
+@given(waypoints)
+def test_between_samples_no_part_is_further_than_half_of_that_from_where_it_was_seen(points):
+    body = bodies().active
+    samples = body.sampled(points[:2])
+    seen = body.segments(samples)
+    fine = samples[:-1, None] + np.linspace(0, 1, 21)[:, None] * np.diff(samples, axis=0)[:, None]
+    ends = body.segments(fine.reshape(-1, 6)).reshape(len(samples) - 1, 21, *seen.shape[1:])
+    away = [np.linalg.norm(ends - at[:, None], axis=-1).max(axis=(2, 3)) for at in (seen[:-1], seen[1:])]
+    assert np.max(np.minimum(*away), initial=0.0) <= BETWEEN_SAMPLES * 1.02
+
+
+def test_clearance_along_a_path_falls_short_of_that_at_its_samples_by_5_mm_at_most():
+    geometry, placement = bodies(), Placement(NOMINAL_T_P_A)
+    rng = np.random.default_rng(11)
+    for start, goal, q_p in rng.uniform(-1.5, 1.5, (20, 3, 6)):
+        sampled, dense = (geometry.active.sampled([start, goal], step) for step in (LARGEST_MOTION, 0.0005))
+        reported, true = (geometry.clearance(path, [q_p], placement).min() for path in (sampled, dense))
+        assert reported - BETWEEN_SAMPLES <= true <= reported + 0.0003
+
+
+def test_an_arm_that_stays_has_one_place():
+    np.testing.assert_array_equal(np.unique(bodies().active.sampled([HERE[0], HERE[0]]), axis=0), HERE)
+    np.testing.assert_array_equal(bodies().active.sampled(HERE), HERE)
+
+
+# Exact shapes
+
+
+def test_what_is_clear_for_the_capsules_is_clear_for_the_true_shapes():
+    cell = paper_cell().cell
+    capsules, exact = CellGeometry.of(cell), ExactCell.of(cell)
+    rng = np.random.default_rng(3)
+    q_a, q_p = rng.uniform(-1.6, 1.6, (2, 250, 6))
+    near = NOMINAL_T_P_A.copy()
+    near[0, 3] = 0.8
+    by_capsules = capsules.clearance(q_a, q_p, Placement(near))
+    truly = np.array([exact.clearance(a, p, near) for a, p in zip(q_a, q_p, strict=True)])
+    apart = by_capsules > 0
+    assert np.sum(apart) > 30
+    assert np.min((truly - by_capsules)[apart]) > -1e-6
+    # The tool's capsules are thicker than what they hold, by the corners of a square housing at most.
+    assert np.max((truly - by_capsules)[apart]) < 0.04
+
+
+def test_links_are_the_same_in_both():
+    cell = paper_cell().cell
+    capsules, exact = CellGeometry.of(cell), ExactCell.of(cell)
+    q_a, q_p = np.zeros(6), np.array([np.pi, 0.0, 0.5, 0.0, 0.5, 0.0])  # the passive arm turns its back
+    near = NOMINAL_T_P_A.copy()
+    near[0, 3] = 0.5
+    links_alone = CellGeometry(*(ArmBody(b.chain, b.links, NOTHING, None) for b in (capsules.active, capsules.passive)))
+    expected = links_alone.between([q_a], [q_p], Placement(near))[0]
+    assert capsules.clearance([q_a], [q_p], Placement(near))[0] == pytest.approx(expected, abs=1e-9)
+    assert exact.clearance(q_a, q_p, near) == pytest.approx(expected, abs=1e-6)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from backends.simulator.noise import generator, normal_image
 from backends.simulator.optics import undistorted_rays
@@ -14,51 +12,24 @@ from dualcal_hal.camera import Intrinsics
 from dualcal_hal.errors import UsageError
 from dualcal_hal.target import Checkerboard
 from dualcal_hal.transforms import Array, rotation_from_vector, transform
+from tests.rendered_corners import (
+    BOARD,
+    CAMERA,
+    DISTORTION,
+    FACING,
+    MARGIN,
+    MATRIX,
+    corners_found,
+    project,
+    random_view,
+)
 
-MATRIX = np.array([[812.0, 0.0, 511.5], [0.0, 812.0, 383.5], [0.0, 0.0, 1.0]])
-DISTORTION = np.array([-0.12, 0.05, 0.001, -0.0005, 0.01])
-CAMERA = Intrinsics(MATRIX, DISTORTION, (1024, 768))
 SMALL = Intrinsics(np.array([[160.0, 0, 79.5], [0, 160.0, 59.5], [0, 0, 1]]), DISTORTION, (160, 120))
-BOARD = Checkerboard(3, 3, 0.025, 4)
-MARGIN = 0.01
-FACING = np.diag([1.0, -1.0, -1.0])  # R_E_T of a board seen straight from the front, upright
 
 
 @pytest.fixture(scope="module")
 def renderer() -> Renderer:
     return Renderer(BOARD, MARGIN, CAMERA, blur=0.6)
-
-
-def project(points: Array, T_E_T: Array, camera: Intrinsics = CAMERA) -> Array:
-    rotation, _ = cv2.Rodrigues(T_E_T[:3, :3])
-    pixels, _ = cv2.projectPoints(points, rotation, T_E_T[:3, 3], camera.matrix, camera.distortion)
-    return np.asarray(pixels).reshape(-1, 2)
-
-
-def random_view(rng: np.random.Generator, distance: float) -> Array:
-    """A view of the board, tilted by up to 40 deg, with its pattern wholly in the image."""
-    while True:
-        direction = rng.uniform(0, 2 * np.pi)
-        tilt = np.radians(rng.uniform(0, 40)) * np.array([np.cos(direction), np.sin(direction), 0.0])
-        turn = [0.0, 0.0, rng.uniform(-np.pi, np.pi)]
-        R = rotation_from_vector(turn) @ rotation_from_vector(tilt) @ FACING
-        T_E_T = transform(R, distance * np.array([*rng.uniform(-0.5, 0.5, 2), 1.0]))
-        pixels = project(BOARD.outline, T_E_T)
-        if np.all(pixels > 8) and np.all(pixels < np.array(CAMERA.size) - 9):
-            return T_E_T
-
-
-def saddle(image: NDArray[np.uint8], start: Array) -> Array:
-    """Saddle point of the quadratic that fits the smoothed patch around ``start`` best."""
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.5)
-    v, u = (grid.ravel() for grid in np.mgrid[-5.0:6.0, -5.0:6.0])
-    terms = np.stack([u * u, u * v, v * v, u, v, np.ones_like(u)], axis=1)
-    point = start.copy()
-    for _ in range(5):
-        patch = cv2.getRectSubPix(smooth, (11, 11), (float(point[0]), float(point[1])))
-        a, b, c, d, e, _ = np.linalg.lstsq(terms, patch.ravel(), rcond=None)[0]
-        point = point + np.linalg.solve([[2 * a, b], [b, 2 * c]], [-d, -e])
-    return point
 
 
 def corner_errors(renderer: Renderer, distances: Array, seed: int) -> Array:
@@ -67,14 +38,13 @@ def corner_errors(renderer: Renderer, distances: Array, seed: int) -> Array:
     errors = []
     for distance in distances:
         T_E_T = random_view(rng, distance)
-        image = np.rint(renderer.render(T_E_T)).astype(np.uint8)
         expected = project(BOARD.corners, T_E_T)
-        errors += [saddle(image, corner + rng.uniform(-0.3, 0.3, 2)) - corner for corner in expected]
-    return np.array(errors)
+        errors.append(corners_found(renderer.render(T_E_T), expected + rng.uniform(-0.3, 0.3, (9, 2))) - expected)
+    return np.concatenate(errors)
 
 
 def test_corners_are_where_the_distorted_camera_sees_them(renderer: Renderer) -> None:
-    errors = corner_errors(renderer, np.linspace(0.3, 0.5, 100), seed=1)
+    errors = corner_errors(renderer, np.linspace(0.3, 0.5, 200), seed=1)
     assert np.sqrt(np.mean(errors**2)) <= 0.005
     assert np.all(np.abs(errors.mean(axis=0)) <= 0.002)
     assert np.abs(errors).max() < 0.03
@@ -114,9 +84,8 @@ def test_the_top_left_square_is_black_and_colours_alternate(renderer: Renderer) 
 def test_the_board_may_have_any_size_and_feature_point() -> None:
     board = Checkerboard(4, 6, 0.01, 0)
     T_E_T = transform(rotation_from_vector([0.2, 0.3, 0.1]) @ FACING, [-0.02, -0.02, 0.3])
-    image = np.rint(Renderer(board, 0.005, CAMERA, blur=0.6).render(T_E_T)).astype(np.uint8)
     expected = project(board.corners, T_E_T)
-    found = np.array([saddle(image, corner) for corner in expected])
+    found = corners_found(Renderer(board, 0.005, CAMERA, blur=0.6).render(T_E_T), expected)
     np.testing.assert_allclose(found, expected, atol=0.03)
 
 

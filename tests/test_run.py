@@ -283,6 +283,28 @@ def test_a_dry_run_opens_no_device_writes_nothing_and_shows_way_looks_and_plan(t
         assert words in result.stdout
 
 
+def test_a_dry_run_with_a_folder_leaves_the_plan_and_its_picture_there(tmp_path):
+    result = dualcal("run", PAPER, "--dry-run", "--out", tmp_path / "dry", *sets(*SMALL))
+    assert result.exit_code == 0
+    plan = json.loads((tmp_path / "dry" / "plan.json").read_text())
+    assert plan["provisional"] is True
+    assert plan["axis_spread"] >= 0.1
+    assert [c["constraint"] for c in plan["constraints"]][-1] == "verification/00"
+    assert all(
+        c["manipulability"] > 0 and c["joint_margin_rad"] >= 0 and c["expected_s"] > 0 for c in plan["constraints"]
+    )
+    picture = cv2.imread(str(tmp_path / "dry" / "plan.png"))
+    assert picture.shape == (900, 1600, 3)
+    assert str(tmp_path / "dry") in result.stdout
+
+
+def test_a_dry_run_writes_nothing_over_a_finished_session(session):
+    result = dualcal("run", PAPER, "--dry-run", "--out", session, *sets(*SMALL))
+    assert result.exit_code == 2
+    assert "not an empty folder" in result.stderr
+    assert json.loads((session / "plan.json").read_text())["provisional"] is False
+
+
 def test_a_dry_run_without_a_plan_from_the_nominal_still_shows_the_looks(monkeypatch):
     from dualcal_hal.errors import NoPlan
     from procedures.planning.poses import PosePlanner

@@ -20,7 +20,7 @@ from backends.simulator import SimulatorBackend
 from backends.simulator.camera import LATENCY
 from backends.simulator.noise import generator
 from backends.simulator.robot import STATE_PERIOD
-from backends.simulator.stepper import KinematicStepper
+from backends.simulator.trajectory import Trajectory
 from backends.simulator.world import World
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.clock import VirtualClock
@@ -39,7 +39,7 @@ NEVER = threading.Event()
 
 @cache
 def cell(*overrides: str) -> CellFile:
-    return load_cell(PAPER_CELL, overrides)
+    return load_cell(PAPER_CELL, ("simulation.stepper=kinematic", *overrides))
 
 
 @pytest.fixture
@@ -107,7 +107,7 @@ def test_the_camera_sees_the_reference_captures(capture: dict[str, list[float]])
     for name, key in ((ACTIVE, "active_joints_rad"), (PASSIVE, "passive_joints_rad")):
         q, fast = tuple(capture[key]), (1.0,) * 6
         world.arms[name].follow(JointPath((q,), fast, fast))
-    T_E_T = world.T_E_T(math.inf)
+    T_E_T = world.T_E_T(60.0)
     camera, board = file.cell.camera.intrinsics, file.cell.target.board
     rotation, _ = cv2.Rodrigues(T_E_T[:3, :3])
     corners, _ = cv2.projectPoints(board.corners, rotation, T_E_T[:3, 3], camera.matrix, camera.distortion)
@@ -237,19 +237,20 @@ BOUND = st.floats(0.1, 5.0)
 def test_a_path_is_followed_straight_within_its_bounds_and_with_a_rest_at_each_waypoint(
     waypoints: list[Joints], speed: Joints, acceleration: Joints
 ) -> None:
-    stepper = KinematicStepper(np.zeros(3), np.array(acceleration))
+    trajectory = Trajectory(np.zeros(3), np.array(acceleration))
     begin = 7.0
-    end = stepper.follow(JointPath(tuple(waypoints), speed, acceleration), begin)
+    trajectory.follow(JointPath(tuple(waypoints), speed, acceleration), begin)
+    end = trajectory.end
     times = np.linspace(begin, end, 400)
-    q, velocity = (np.array(values) for values in zip(*map(stepper.sample, times), strict=True))
+    q, velocity = (np.array(values) for values in zip(*map(trajectory.sample, times), strict=True))
     step = (end - begin) / 399
     assert np.all(np.abs(velocity) <= np.array(speed) * (1 + 1e-9) + 1e-9)
     assert np.all(np.abs(np.diff(velocity, axis=0)) <= np.array(acceleration) * step * (1 + 1e-6) + 1e-9)
     assert np.all(np.abs(np.diff(q, axis=0)) <= np.array(speed) * step * (1 + 1e-6) + 1e-9)
     corners = np.array([(0.0, 0.0, 0.0), *waypoints])
     assert max(distance_to_polyline(point, corners) for point in q[::10]) < 1e-9
-    assert tuple(stepper.sample(end)[0]) == waypoints[-1] == stepper.destination()
-    assert not stepper.sample(end)[1].any()
+    assert tuple(trajectory.sample(end)[0]) == waypoints[-1] == trajectory.destination
+    assert not trajectory.sample(end)[1].any()
 
 
 def distance_to_polyline(point: Array, corners: Array) -> float:
@@ -266,9 +267,9 @@ def distance_to_polyline(point: Array, corners: Array) -> float:
     [(4.0, 2.0 / 1.0 + 4.0 / 2.0), (1.0, 2.0)],  # v / a + way / v; 2 sqrt(way / a)
 )
 def test_a_segment_takes_as_long_as_its_trapezoid_or_triangle(way: float, expected: float) -> None:
-    stepper = KinematicStepper(np.zeros(2), np.ones(2))
-    path = JointPath(((way, -way / 3),), (2.0, 2.0), (1.0, 1.0))
-    assert stepper.follow(path, 0.0) == pytest.approx(expected)
+    trajectory = Trajectory(np.zeros(2), np.ones(2))
+    trajectory.follow(JointPath(((way, -way / 3),), (2.0, 2.0), (1.0, 1.0)), 0.0)
+    assert trajectory.end == pytest.approx(expected)
 
 
 def test_a_path_faster_than_the_arm_is_refused_and_the_arms_own_speed_is_kept(exact: SimulatorBackend) -> None:
@@ -286,13 +287,13 @@ def test_a_path_faster_than_the_arm_is_refused_and_the_arms_own_speed_is_kept(ex
 @given(when=st.floats(0.0, 3.0))
 def test_a_stop_brakes_along_the_path_as_fast_as_the_arm_can(when: float) -> None:
     arm_acceleration = np.array([4.0, 2.0])
-    stepper = KinematicStepper(np.zeros(2), arm_acceleration)
+    trajectory = Trajectory(np.zeros(2), arm_acceleration)
     way = np.array([1.0, -0.5])
-    stepper.follow(JointPath((tuple(way),), (1.0, 1.0), (1.0, 1.0)), 0.0)
-    _, velocity = stepper.sample(when)
-    end = stepper.brake(when)
-    assert end - when == pytest.approx(np.max(np.abs(velocity) / arm_acceleration))
-    rest, still = stepper.sample(end)
+    trajectory.follow(JointPath((tuple(way),), (1.0, 1.0), (1.0, 1.0)), 0.0)
+    _, velocity = trajectory.sample(when)
+    trajectory.brake(when)
+    assert trajectory.end - when == pytest.approx(np.max(np.abs(velocity) / arm_acceleration))
+    rest, still = trajectory.sample(trajectory.end)
     assert not still.any()
     assert abs(rest[0] * way[1] - rest[1] * way[0]) < 1e-12
     assert 0.0 <= rest[0] <= 1.0 + 1e-12

@@ -190,12 +190,19 @@ def test_unverified_results_have_no_mismatch_table() -> None:
 # -- plan and way ------------------------------------------------------------------------------------------------------
 
 
-def test_a_plan_shows_distance_tilt_and_least_clearance_of_each_constraint() -> None:
+def test_a_plan_shows_what_it_says_of_each_constraint() -> None:
     text = printed(plan_table(plan()))
     assert "Plan, from 5 first looks" in text
-    assert row(text, "calibration/06") == ["4", "500", "to", "440", "0", "to", "17", "70"]
-    assert row(text, "verification/01") == ["7", "500", "to", "380", "0", "to", "34", "40"]
+    assert row(text, "calibration/06") == ["4", "500-440", "0-17", "70", "12.3", "20", "6.5"]
+    assert row(text, "verification/01") == ["7", "500-380", "0-34", "40", "12.3", "20", "6.5"]
     assert len([line for line in text.splitlines() if "calibration/" in line]) == 7
+
+
+def test_below_a_plan_stand_its_time_and_the_spread_of_its_axes() -> None:
+    text = printed(plan_table(plan()))
+    assert f"About {9 * 6.5:.0f} s in all" in text
+    assert "Spread of the axes 0.123: least eigenvalue of mean(z z^T), at least 0.1." in text
+    assert "Spread" not in printed(plan_table(replace(plan(), axis_spread=None)))
 
 
 def test_a_provisional_plan_is_marked_so() -> None:
@@ -207,6 +214,13 @@ def test_a_way_shows_its_moves_in_order_with_joints_in_degrees() -> None:
     text = printed(way_table(legs))
     assert row(text, "1") == ["left", "5.7", "-11.5", "17.2", "0.0", "28.6", "180.0"]
     assert row(text, "2") == ["right", "-57.3", "0.0", "0.0", "0.0", "0.0", "0.0"]
+
+
+def test_a_move_through_waypoints_shows_each_of_them() -> None:
+    text = printed(way_table([Leg("left", ((0.1,) * 6, (0.2,) * 6)), Leg("right", ((0.3,) * 6,))]))
+    assert row(text, "1") == ["left", *["5.7"] * 6]
+    assert row(text, "left") == ["11.5"] * 6
+    assert row(text, "2") == ["right", *["17.2"] * 6]
 
 
 def test_an_arm_named_in_brackets_keeps_its_name() -> None:

@@ -2,62 +2,70 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
-from backends.simulator.stepper import Stepper
-from dualcal_hal.errors import CommandRefused
+import numpy as np
+
+from backends.simulator.mechanics import Approach
+from dualcal_hal.errors import CommandRefused, Contact
 from dualcal_hal.robot import JointPath, Joints, Mode, Motion, RobotState, StopResult
 from dualcal_hal.transforms import Array
 
 if TYPE_CHECKING:
     from backends.simulator.world import World
-    from dualcal_hal.config import RobotConfig
+
+LONGEST_SETTLING = 3.0
+"""Seconds after the end of its set points within which an arm must have settled."""
 
 
 class SimulatedArm:
     """``target``: where it was sent last, in rad; after a stop, where that brought it to rest."""
 
-    def __init__(self, name: str, config: RobotConfig, world: World) -> None:
+    def __init__(self, name: str, world: World) -> None:
         self._name = name
         self._world = world
-        self._stepper: Stepper = world.stepper(config.home, config.acceleration)
+        self._stepper = world.stepper
         self._motion: Motion | None = None
         self._stop_reason: str | None = None
         self._sequence = 0
         self._mode = Mode.READY
-        self.target: Joints = self._stepper.destination()
+        self.target: Joints = self._stepper.destination(name)
+        self._approach = Approach.at_rest(len(self.target))
         self._begin = self._end = world.clock.now()
         self._error_before = self._error_after = world.joint_error(name, self.target)
 
     def true_positions(self, when: float) -> Array:
         """(n,) rad at time ``when``, the error that the encoders do not see included."""
-        return self._stepper.sample(when)[0] + self._joint_error(when)
+        with self._world.lock:
+            read = self._stepper.sample(self._name, when)[0]
+            return self._world.truth.link_angles(self._name, read, self._approach, when) + self._joint_error(when)
 
     def state(self, stream: str) -> RobotState:
         """What its encoders read now; each ``stream`` of states has noise of its own."""
         with self._world.lock:
             now = self._world.clock.now()
-            positions, velocities = self._stepper.sample(now)
+            positions, velocities = self._stepper.sample(self._name, now - self._world.time_skew)
             noise = self._world.sample_noise(self._name, stream).standard_normal(len(positions))
             positions = positions + self._world.noise.encoder * noise
             self._sequence += 1
-            return RobotState(
-                tuple(positions.tolist()), tuple(velocities.tolist()), self._mode, (), now, self._sequence
-            )
+            fault = self._stepper.fault
+            mode, faults = (self._mode, ()) if fault is None else (Mode.FAULT, (fault,))
+            return RobotState(tuple(positions.tolist()), tuple(velocities.tolist()), mode, faults, now, self._sequence)
 
     def follow(self, path: JointPath) -> Motion:
-        """Begin to follow a path that the arm can follow; CommandRefused if it moves or is switched off."""
+        """Begin to follow a path that the arm can follow; CommandRefused if it is moving, off or at fault."""
         self._finish(self._motion)
         with self._world.lock:
             self._refuse_if_moving("move")
+            self._refuse_if_faulty("move")
             if self._mode is not Mode.READY:
                 raise CommandRefused(self._name, "move", "its drives are off", "enable it")
             motion = self._motion = Motion(self._name, self._world.clock)
             self._stop_reason = None
             now = self._world.clock.now()
-            self._rest_anew(now, self._stepper.follow(path, now))
-        self._world.clock.call_at(self._end, partial(self._finish, motion))
+            stretches = np.diff([self.target, *path.waypoints], axis=0)
+            self._rest_anew(now, self._stepper.follow(self._name, path, now), stretches)
+        self._look_again(motion)
         return motion
 
     def stop(self, reason: str) -> StopResult:
@@ -70,11 +78,13 @@ class SimulatedArm:
             if self._stop_reason is None:
                 self._stop_reason = reason
                 now = self._world.clock.now()
-                self._rest_anew(now, self._stepper.brake(now))
-            end = self._end
-        self._world.clock.call_at(end, partial(self._finish, motion))
-        self._world.clock.wait(self._world.closed, end)
-        self._finish(motion)
+                here = self._stepper.sample(self._name, now)[0]
+                end = self._stepper.brake(self._name, now)
+                self._rest_anew(now, end, self._stepper.destination(self._name) - here[None])
+        self._look_again(motion)
+        while self._motion is motion and not self._world.closed.is_set():
+            self._world.clock.wait(self._world.closed, self._next_look())
+            self._finish(motion)
         with self._world.lock:
             return StopResult(confirmed=self._motion is not motion)
 
@@ -83,6 +93,7 @@ class SimulatedArm:
         self._finish(self._motion)
         with self._world.lock:
             self._refuse_if_moving("switch the drives")
+            self._refuse_if_faulty("switch the drives")
             self._mode = mode
 
     def halt(self, reason: str) -> None:
@@ -92,24 +103,50 @@ class SimulatedArm:
         if motion is not None:
             motion.stop(reason)
 
-    def _finish(self, motion: Motion | None) -> None:
-        """End ``motion`` if it is the present one and its time has come; its listeners run without the lock."""
+    def _look_again(self, motion: Motion) -> None:
+        """Have the clock look whether ``motion`` is over, again and again until it is."""
+
+        def look() -> None:
+            self._finish(motion)
+            if self._motion is motion:
+                self._look_again(motion)
+
+        self._world.clock.call_at(self._next_look(), look)
+
+    def _next_look(self) -> float:
         with self._world.lock:
-            if motion is None or motion is not self._motion or self._world.clock.now() < self._end:
+            now = self._world.clock.now()
+            later = self._stepper.next_look(self._name, now)
+            return now if later is None else later
+
+    def _finish(self, motion: Motion | None) -> None:
+        """End ``motion`` if it is the present one and is over; its listeners run without the lock."""
+        with self._world.lock:
+            now = self._world.clock.now()
+            if motion is None or motion is not self._motion:
+                return
+            settled = self._stepper.next_look(self._name, now) is None
+            if not settled and now <= self._end + LONGEST_SETTLING:
                 return
             self._motion = None
-            stop_reason = self._stop_reason
+            fault, stop_reason = self._stepper.fault, self._stop_reason
             final = self.state("arrival")
-        if stop_reason is None:
+        if fault is not None:
+            motion.fail(fault, "open the simulator anew", Contact)
+        elif not settled:
+            motion.fail(f"not settled {LONGEST_SETTLING:g} s after its set points came to rest")
+        elif stop_reason is None:
             motion.settle(final)
         else:
             motion.stop(stop_reason)
 
-    def _rest_anew(self, begin: float, end: float) -> None:
-        """The stepper has another destination; the joints' error drifts to the one that belongs there."""
+    def _rest_anew(self, begin: float, end: float, stretches: Array) -> None:
+        """The stepper has another destination, by straight ``stretches`` (k, n) in rad; the joints' error drifts to
+        the one that belongs there."""
         self._error_before = self._joint_error(begin)
+        self._approach = self._world.truth.approach(self._approach, stretches, end)
         self._begin, self._end = begin, end
-        destination = self._stepper.destination()
+        destination = self._stepper.destination(self._name)
         if destination != self.target:
             self.target = destination
             self._world.target_changed()
@@ -124,3 +161,7 @@ class SimulatedArm:
     def _refuse_if_moving(self, attempted: str) -> None:
         if self._motion is not None:
             raise CommandRefused(self._name, attempted, "it is moving", "wait for its motion or stop it")
+
+    def _refuse_if_faulty(self, attempted: str) -> None:
+        if self._stepper.fault is not None:
+            raise CommandRefused(self._name, attempted, self._stepper.fault, "open the simulator anew")

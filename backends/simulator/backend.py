@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from backends.simulator.camera import SimulatedCamera
+from backends.simulator.camera import Sight, SimulatedCamera
 from backends.simulator.rendering import Renderer
 from backends.simulator.robot import SimulatedRobot
+from backends.simulator.scene import Scene
+from backends.simulator.stepper import stepper_class
 from backends.simulator.world import World
 from dualcal_hal.backend import Backend
 from dualcal_hal.clock import VirtualClock
@@ -40,11 +43,12 @@ class SimulatorBackend(Backend):
     def __init__(self, name: str, cell: CellFile) -> None:
         super().__init__(name, cell)
         self._simulation = _simulation(name, cell)
+        stepper_class(self._simulation.stepper)  # refused now, before anything is begun
         self._clock = VirtualClock()
-        self._open: tuple[World, Renderer] | None = None
+        self._open: Sight | None = None
         robots = cell.cell.robots.items()
         self._robots = {arm: SimulatedRobot(arm, config, self._opened_world) for arm, config in robots}
-        self._camera = SimulatedCamera(CAMERA, self._opened)
+        self._camera = SimulatedCamera(CAMERA, self._opened, self._simulation.errors.motion_blur.exposure)
 
     @property
     def clock(self) -> VirtualClock:
@@ -53,15 +57,17 @@ class SimulatorBackend(Backend):
     def open(self, timeout: float) -> None:
         if self._open is not None:
             raise UsageError(f"{self.name}: open: it is open already; close it first")
-        cell = self.cell.cell
-        board, margin = cell.target.board, cell.target.margin
-        renderer = Renderer(board, margin, cell.camera.intrinsics, self._simulation.noise.blur_px)
-        self._open = World(cell, self._simulation, self._clock), renderer
+        cell, simulation = self.cell.cell, self._simulation
+        board, margin, intrinsics = cell.target.board, cell.target.margin, cell.camera.intrinsics
+        renderer = Renderer(board, margin, intrinsics, simulation.noise.blur_px, simulation.errors)
+        world = World(cell, simulation, self._clock)
+        bodies = world.stepper.scene
+        self._open = Sight(world, renderer, None if bodies is None else Scene(bodies, cell, renderer.rays))
 
     def close(self) -> None:
         opened, self._open = self._open, None
         if opened is not None:
-            opened[0].close()
+            opened.world.close()
 
     def robot(self, name: str) -> SimulatedRobot:
         if name not in self._robots:
@@ -73,13 +79,16 @@ class SimulatorBackend(Backend):
             raise UnknownDevice(name, "find the camera", f"'{self.name}' has {CAMERA}")
         return self._camera
 
-    def _opened(self, device: str, attempted: str) -> tuple[World, Renderer]:
+    def documents(self) -> Mapping[str, dict[str, Any]]:
+        return {} if self._open is None else self._open.world.documents()
+
+    def _opened(self, device: str, attempted: str) -> Sight:
         if self._open is None:
             raise NotOpen(device, attempted, f"backend '{self.name}' is not open", "open it first")
         return self._open
 
     def _opened_world(self, device: str, attempted: str) -> World:
-        return self._opened(device, attempted)[0]
+        return self._opened(device, attempted).world
 
 
 def _simulation(name: str, cell: CellFile) -> SimulationConfig:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
 
@@ -9,19 +11,49 @@ from dualcal_hal.camera import Intrinsics
 from dualcal_hal.errors import UsageError
 from dualcal_hal.transforms import Array
 
+if TYPE_CHECKING:
+    from dualcal_hal.config.image_errors import ImageErrorsConfig
+
+
+def true_intrinsics(intrinsics: Intrinsics, errors: ImageErrorsConfig) -> Intrinsics:
+    """The camera as it is, of which the cell file says ``intrinsics``."""
+    focal, centre = errors.focal, errors.principal_point
+    matrix = intrinsics.matrix.copy()
+    matrix[:2, :2] *= np.array([1.0 + focal.x_ppm * 1e-6, 1.0 + focal.y_ppm * 1e-6])
+    matrix[:2, 2] += centre.right_px, centre.down_px
+    distortion = intrinsics.distortion.copy()
+    distortion[0] += _residual_k1(intrinsics, errors.distortion_residual.corner_px)
+    return Intrinsics(matrix, distortion, intrinsics.size)
+
+
+def _residual_k1(intrinsics: Intrinsics, displacement: float) -> float:
+    """The change of k1 that moves what is seen in the farthest corner of the image outwards by so many px."""
+    if displacement == 0.0:
+        return 0.0
+    width, height = intrinsics.size
+    corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=float)
+    rays = undistorted(corners, intrinsics)
+    per_k1 = np.sum(rays**2, axis=1) * np.linalg.norm(rays * np.diag(intrinsics.matrix)[:2], axis=1)
+    return displacement / float(per_k1.max())
+
 
 def undistorted_rays(intrinsics: Intrinsics) -> Array:
-    """(height, width, 2): the undistorted normalised coordinates of each pixel's centre, exact to 1e-9 px.
+    """(height, width, 2): the undistorted normalised coordinates of each pixel's centre, as :func:`undistorted`."""
+    width, height = intrinsics.size
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(float)
+    return undistorted(pixels, intrinsics).reshape(height, width, 2)
+
+
+def undistorted(pixels: Array, intrinsics: Intrinsics) -> Array:
+    """(n, 2): the undistorted normalised coordinates of ``pixels`` (n, 2), exact to 1e-9 px.
 
     OpenCV stops at its count of iterations without a word, so the result is checked, and iterated on.
     Raises UsageError if the distortion cannot be undone in some pixel.
     """
-    width, height = intrinsics.size
     focal = np.diag(intrinsics.matrix)[:2]
-    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(float)
     seen = (pixels - intrinsics.principal_point) / focal
     if not intrinsics.distortion.any():
-        return seen.reshape(height, width, 2)
+        return np.asarray(seen)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
     ideal = cv2.undistortImagePoints(pixels, intrinsics.matrix, intrinsics.distortion, None, criteria)
     rays = (np.asarray(ideal, dtype=float).reshape(-1, 2) - intrinsics.principal_point) / focal
@@ -30,7 +62,7 @@ def undistorted_rays(intrinsics: Intrinsics) -> Array:
         missing = seen - _distorted(rays, intrinsics.distortion)
         previous, worst = worst, float(np.abs(missing * focal).max())
         if worst < 1e-9:
-            return rays.reshape(height, width, 2)
+            return np.asarray(rays)
         if not worst < 0.9 * previous:
             break
         rays += missing

@@ -8,10 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dualcal_hal.target import Checkerboard
+from dualcal_hal.target import Target
+from dualcal_hal.transforms import Mask
 
 Values = NDArray[np.float32]
 
@@ -21,17 +23,27 @@ _PARTS = 6  # per pixel in each direction, where edges cross
 class CheckerPattern:
     """A checkerboard with ``margin`` m of white beyond the outer squares."""
 
-    def __init__(self, board: Checkerboard, margin: float) -> None:
+    def __init__(self, board: Target, margin: float) -> None:
         self._board, self._margin = board, margin
 
     def paint(self, x: Values, y: Values) -> tuple[Values, Values]:
-        """How much of each pixel, seen at (x, y) m in T, is plate, and how much of that is black."""
+        """How much of each pixel, seen at (x, y) m in T, is plate, and how much of that is black; (height, width)."""
         board, (left, top) = self._board, self._board.outline[0, :2].tolist()
         margin = self._margin / board.square
         across = _Stripes.of_image((x - left) / board.square, board.columns + 1)
         down = _Stripes.of_image((top - y) / board.square, board.rows + 1)
-        pattern = across.within(0.0) * down.within(0.0)
-        return across.within(margin) * down.within(margin), pattern * (0.5 + 0.5 * _parity(across, down))
+        plate = (across.holds(margin) & down.holds(margin)).astype(np.float32)
+        black = (across.holds(0.0) & down.holds(0.0) & ~(across.is_odd() ^ down.is_odd())).astype(np.float32)
+        # Most pixels show one colour; the others are worth an average.
+        mixed = np.nonzero(across.reaches(margin) & down.reaches(margin) & (across.mixes(margin) | down.mixes(margin)))
+        plate[mixed], black[mixed] = _averaged(across.at(mixed), down.at(mixed), margin)
+        return plate, black
+
+
+def _averaged(across: _Stripes, down: _Stripes, margin: float) -> tuple[Values, Values]:
+    """The shares of plate, and of black in that, over each pixel's area."""
+    pattern = across.within(0.0) * down.within(0.0)
+    return across.within(margin) * down.within(margin), pattern * (0.5 + 0.5 * _parity(across, down))
 
 
 def _parity(across: _Stripes, down: _Stripes) -> Values:
@@ -60,8 +72,42 @@ class _Stripes:
     @classmethod
     def of_image(cls, position: Values, squares: int) -> _Stripes:
         """``position``: (height, width)."""
-        along_v, along_u = (np.asarray(np.gradient(position, axis=axis)) for axis in (0, 1))
-        return cls(position, along_u, along_v, squares)
+        along_u, along_v = (cv2.Sobel(position, cv2.CV_32F, *order, ksize=1, scale=0.5) for order in ((1, 0), (0, 1)))
+        # Beyond the border there is nothing to take a central difference with.
+        along_u[:, [0, -1]] = np.diff(position[:, [0, 1, -2, -1]], axis=1)[:, [0, 2]]
+        along_v[[0, -1]] = np.diff(position[[0, 1, -2, -1]], axis=0)[[0, 2]]
+        return cls(position, np.asarray(along_u), np.asarray(along_v), squares)
+
+    def at(self, pixels: tuple[NDArray[np.intp], ...]) -> _Stripes:
+        """The same of chosen pixels."""
+        return _Stripes(self.position[pixels], self.along_u[pixels], self.along_v[pixels], self.squares)
+
+    def holds(self, margin: float) -> Mask:
+        """Whether each pixel's centre is inside the outer edges moved outwards by ``margin`` squares."""
+        return self._off_middle < self.squares / 2 + margin
+
+    def reaches(self, margin: float) -> Mask:
+        """Whether some of each pixel may be inside those."""
+        return self._off_middle - self._reach < self.squares / 2 + margin
+
+    def mixes(self, margin: float) -> Mask:
+        """Whether some of each pixel may be outside those, or on the other side of an edge between squares."""
+        off_line = np.abs(self.position - np.rint(self.position))
+        return (off_line < self._reach) | (self._off_middle + self._reach > self.squares / 2 + margin)
+
+    def is_odd(self) -> Mask:
+        """Whether each pixel's centre is in the second, fourth, ... stripe."""
+        half = 0.5 * self.position
+        return np.asarray(half - np.floor(half) >= 0.5)
+
+    @cached_property
+    def _off_middle(self) -> Values:
+        return np.asarray(np.abs(self.position - self.squares / 2))
+
+    @cached_property
+    def _reach(self) -> Values:
+        """How far each pixel extends to both sides of its centre."""
+        return np.asarray(0.5 * (np.abs(self.along_u) + np.abs(self.along_v)), dtype=np.float32)
 
     def divided(self, pixels: tuple[NDArray[np.intp], ...]) -> _Stripes:
         """Parts of the chosen (n,) pixels as pixels of their own, (parts, n)."""

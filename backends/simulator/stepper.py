@@ -1,119 +1,94 @@
-"""How a simulated arm moves between joint angles."""
+"""What moves the arms' joints: one object for all arms of a world, as they may meet."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from backends.simulator.trajectory import Trajectory
+from dualcal_hal.errors import CellFileError, Problem
 from dualcal_hal.robot import JointPath, Joints
 from dualcal_hal.transforms import Array
 
-_NO_MOVE = 1e-12  # rad
+if TYPE_CHECKING:
+    from backends.simulator.bullet.bodies import BulletBodies
+    from backends.simulator.truth import Truth
+    from dualcal_hal.config import CellConfig
 
 
 class Stepper(ABC):
-    """One arm's motion in simulated time; times in s never go back."""
+    """Moves the joints along the arms' trajectories, in simulated time that never goes back.
+
+    Called under the world's lock. ``fault``: the contact that has halted all arms for good, None without one.
+    ``scene``: PyBullet's bodies, None where there are none.
+    """
+
+    scene: BulletBodies | None = None
+
+    def __init__(self, cell: CellConfig, truth: Truth) -> None:
+        self.fault: str | None = None
+        self._trajectories = {
+            name: Trajectory(robot.home, robot.acceleration) for name, robot in sorted(cell.robots.items())
+        }
+
+    def follow(self, arm: str, path: JointPath, now: float) -> float:
+        """Have an arm at rest begin to follow ``path``; returns when its set points come to rest."""
+        trajectory = self._trajectories[arm]
+        trajectory.follow(path, now)
+        return trajectory.end
+
+    def brake(self, arm: str, now: float) -> float:
+        """Bring an arm to rest on its path as fast as it can; returns when its set points come to rest."""
+        trajectory = self._trajectories[arm]
+        trajectory.brake(now)
+        return trajectory.end
+
+    def destination(self, arm: str) -> Joints:
+        """The joint angles in rad at which an arm is to rest, or does."""
+        return self._trajectories[arm].destination
 
     @abstractmethod
-    def follow(self, path: JointPath, now: float) -> float:
-        """Begin at rest to follow ``path``, whose speeds the arm can keep; returns when it will have settled."""
+    def sample(self, arm: str, when: float) -> tuple[Array, Array]:
+        """An arm's joint angles (n,) in rad and velocities (n,) in rad/s."""
 
     @abstractmethod
-    def brake(self, now: float) -> float:
-        """Come to rest on the path as fast as the arm can; returns when it will have settled."""
+    def next_look(self, arm: str, now: float) -> float | None:
+        """When to look again whether an arm has settled; None once it has, or has halted by the ``fault``."""
+
+    def documents(self) -> Mapping[str, dict[str, Any]]:
+        """What it measured that is to be kept beside the run, by file name."""
+        return {}
 
     @abstractmethod
-    def sample(self, when: float) -> tuple[Array, Array]:
-        """Joint angles (n,) in rad and velocities (n,) in rad/s."""
-
-    @abstractmethod
-    def destination(self) -> Joints:
-        """The joint angles in rad at which it will rest, or does."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Phase:
-    """A stretch of constant acceleration; (n,) arrays at its ``begin``, times in s."""
-
-    begin: float
-    duration: float
-    position: Array
-    velocity: Array
-    acceleration: Array
-
-    @property
-    def end(self) -> float:
-        return self.begin + self.duration
-
-    def sample(self, when: float) -> tuple[Array, Array]:
-        t = when - self.begin
-        position = self.position + t * (self.velocity + 0.5 * t * self.acceleration)
-        return position, self.velocity + t * self.acceleration
+    def close(self) -> None:
+        """Release what it holds."""
 
 
 class KinematicStepper(Stepper):
-    """Follows its profile exactly: an analytic function of time.
+    """Joints are exactly where their trajectories have them; nothing is in anything's way."""
 
-    On each segment all joints move in proportion, by the shortest trapezoidal (or triangular) profile of
-    velocity that no joint's speed and acceleration forbids.
-    """
+    def sample(self, arm: str, when: float) -> tuple[Array, Array]:
+        return self._trajectories[arm].sample(when)
 
-    def __init__(self, home: Array, acceleration: Array) -> None:
-        self._acceleration = acceleration
-        self._phases: tuple[_Phase, ...] = ()
-        self._rest = np.array(home, dtype=float)
+    def next_look(self, arm: str, now: float) -> float | None:
+        end = self._trajectories[arm].end
+        return end if now < end else None
 
-    def follow(self, path: JointPath, now: float) -> float:
-        speed, acceleration = np.array(path.speed), np.array(path.acceleration)
-        phases: list[_Phase] = []
-        end, position = now, self._rest
-        for waypoint in path.waypoints:
-            phases += _segment(end, position, np.array(waypoint), speed, acceleration)
-            end = phases[-1].end if phases else now
-            position = np.array(waypoint)
-        self._phases, self._rest = tuple(phases), position
-        return end
-
-    def brake(self, now: float) -> float:
-        position, velocity = self.sample(now)
-        # All joints slow down in proportion, so the arm stays on its segment.
-        duration = float(np.max(np.abs(velocity) / self._acceleration))
-        if duration == 0.0:
-            self._phases, self._rest = (), position
-            return now
-        braking = _Phase(now, duration, position, velocity, -velocity / duration)
-        self._phases, self._rest = (braking,), position + 0.5 * duration * velocity
-        return braking.end
-
-    def sample(self, when: float) -> tuple[Array, Array]:
-        for phase in self._phases:
-            if when < phase.end:
-                return phase.sample(max(when, phase.begin))
-        return self._rest.copy(), np.zeros_like(self._rest)
-
-    def destination(self) -> Joints:
-        return tuple(self._rest.tolist())
+    def close(self) -> None:
+        """It holds nothing."""
 
 
-def _segment(begin: float, start: Array, end: Array, speed: Array, acceleration: Array) -> Iterator[_Phase]:
-    """The phases of a straight segment between two rests."""
-    way = end - start
-    if np.max(np.abs(way)) < _NO_MOVE:
-        return
-    # In shares of the segment; the slowest joint sets the pace.
-    gain = 1.0 / float(np.max(np.abs(way) / acceleration))
-    peak = min(1.0 / float(np.max(np.abs(way) / speed)), gain**0.5)
-    ramp = peak / gain
-    cruise = max(0.0, 1.0 / peak - ramp)
-    still = np.zeros_like(way)
-    up = _Phase(begin, ramp, start, still, gain * way)
-    level = _Phase(up.end, cruise, up.sample(up.end)[0], peak * way, still)
-    down = _Phase(level.end, ramp, level.sample(level.end)[0], peak * way, -gain * way)
-    yield from (up, level, down)
-
-
-STEPPERS: dict[str, type[KinematicStepper]] = {"kinematic": KinematicStepper}
-"""By what a cell file calls them."""
+def stepper_class(name: str) -> type[Stepper]:
+    """By what a cell file calls it; CellFileError if what it needs is not installed."""
+    if name == "kinematic":
+        return KinematicStepper
+    try:
+        from backends.simulator.bullet import BulletStepper
+    except ImportError as error:
+        what = (
+            f"is '{name}', and PyBullet cannot be imported ({error}): pip install 'dualcal[bullet]', "
+            "or do without physics by --set simulation.stepper=kinematic"
+        )
+        raise CellFileError([Problem("simulation.stepper", what)]) from error
+    return BulletStepper

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from backends.simulator.arm import SimulatedArm
 from backends.simulator.noise import generator
-from backends.simulator.stepper import STEPPERS
+from backends.simulator.stepper import Stepper, stepper_class
 from backends.simulator.truth import Truth
 from dualcal_hal.clock import Clock
 from dualcal_hal.robot import Joints
@@ -34,15 +35,16 @@ class World:
         self._active, self._passive = cell.active_name, cell.passive_name
         self.truth = Truth(cell, simulation)
         self._seed = simulation.seed
-        self.stepper = STEPPERS[simulation.stepper]
+        self.time_skew = simulation.errors.time_skew.delay_s
+        self.stepper: Stepper = stepper_class(simulation.stepper)(cell, self.truth)
         self._samples: Counter[tuple[str, str]] = Counter()
-        self.arms = {name: SimulatedArm(name, robot, self) for name, robot in sorted(cell.robots.items())}
+        self.arms = {name: SimulatedArm(name, self) for name in sorted(cell.robots)}
 
     def T_E_T(self, when: float) -> Array:
         """(4, 4): the target in the camera at time ``when``, by the true transforms, chains and joint angles."""
         with self.lock:
             q_a, q_p = (self.arms[name].true_positions(when) for name in (self._active, self._passive))
-        return self.truth.T_E_T(q_a, q_p)
+        return self.truth.T_E_T(q_a, q_p, when)
 
     def joint_error(self, arm: str, target: Joints) -> Array:
         """(n,) rad that the encoders do not see, of an arm that was sent to ``target``: always the same."""
@@ -64,8 +66,15 @@ class World:
         """An arm was sent elsewhere: samples are counted anew (call under the lock)."""
         self._samples.clear()
 
+    def documents(self) -> Mapping[str, dict[str, Any]]:
+        """What was measured in it, by file name."""
+        with self.lock:
+            return self.stepper.documents()
+
     def close(self) -> None:
         """End all motions and all waiting."""
         self.closed.set()
         for arm in self.arms.values():
             arm.halt("the simulator was closed")
+        with self.lock:
+            self.stepper.close()

@@ -10,6 +10,7 @@ from pydantic import Field
 from dualcal_hal import registry
 from dualcal_hal.config.backends import BackendEntry
 from dualcal_hal.config.camera import CameraConfig
+from dualcal_hal.config.fixtures import FixtureConfig
 from dualcal_hal.config.nominal import NominalConfig
 from dualcal_hal.config.procedure import ProcedureConfig
 from dualcal_hal.config.robots import RobotConfig
@@ -36,6 +37,8 @@ class CellConfig(Section):
     procedure: ProcedureConfig
     floor_mm: Number | None = 0.0
     """Height of the floor in each arm's base frame, mm; null for none."""
+    fixtures: dict[str, FixtureConfig] = Field(default={})
+    """What stands about the arms and must not be touched, by a name of your own."""
 
     @property
     def floor(self) -> float | None:
@@ -139,16 +142,27 @@ def _role_problems(robots: Mapping[str, Any], mount: Any) -> Iterator[tuple[Loca
 
 
 def _truth_problems(document: Mapping[str, Any], robots: Mapping[str, Any]) -> Iterator[tuple[Location, str]]:
-    truth = _mapping(_mapping(document.get("simulation")).get("truth"))
-    for name, kinematics in _mapping(truth.get("kinematics")).items():
-        location: Location = ("simulation", "truth", "kinematics", name)
-        if name not in robots:
-            yield location, f"no arm of that name; there are: {_names(robots)}"
-            continue
-        rows = _mapping(kinematics).get("dh")
-        own = _mapping(_mapping(robots[name]).get("kinematics")).get("dh")
-        if isinstance(rows, list) and isinstance(own, list) and len(rows) != len(own):
-            yield (*location, "dh"), f"must have {len(own)} entries, as the arm's own, has {len(rows)}"
+    """What the simulation says of single arms and joints."""
+    simulation = _mapping(document.get("simulation"))
+    kinematics = _mapping(_mapping(simulation.get("truth")).get("kinematics"))
+    for name, given in kinematics.items():
+        location = ("simulation", "truth", "kinematics", name)
+        yield from _per_joint_problems(location, _mapping(given).get("dh"), robots, ("dh",))
+    offsets = _mapping(_mapping(_mapping(simulation.get("errors")).get("joint_zero")).get("offset_deg"))
+    for name, given in offsets.items():
+        yield from _per_joint_problems(("simulation", "errors", "joint_zero", "offset_deg", name), given, robots)
+
+
+def _per_joint_problems(
+    arm: Location, given: Any, robots: Mapping[str, Any], below: Location = ()
+) -> Iterator[tuple[Location, str]]:
+    """Of a list with an entry a joint, at or ``below`` a location whose last key is the arm's name."""
+    if arm[-1] not in robots:
+        yield arm, f"no arm of that name; there are: {_names(robots)}"
+        return
+    own = _mapping(_mapping(robots[str(arm[-1])]).get("kinematics")).get("dh")
+    if isinstance(given, list) and isinstance(own, list) and len(given) != len(own):
+        yield (*arm, *below), f"must have {len(own)} entries, as the arm's own, has {len(given)}"
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

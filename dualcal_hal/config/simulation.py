@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
+from dualcal_hal.config.errors import ErrorsConfig
 from dualcal_hal.config.nominal import TransformsConfig
 from dualcal_hal.config.robots import KinematicsConfig
 from dualcal_hal.config.values import Natural, NotNegative, Section
@@ -53,10 +54,12 @@ class SimulationConfig(Section):
     """The simulated world; neither plan nor estimate may see it."""
 
     seed: Natural
-    """Of the noise."""
-    stepper: Literal["kinematic"]
-    """What moves the simulated arms."""
+    """Of the noise and of the errors that are drawn."""
+    stepper: Literal["kinematic", "bullet"]
+    """What moves the simulated arms: kinematic moves them exactly, bullet by motors, with weight and contact."""
     truth: TruthConfig
     """The cell as it is."""
     noise: NoiseConfig = NoiseConfig()
-    """What disturbs it."""
+    """What disturbs it anew each time."""
+    errors: ErrorsConfig = ErrorsConfig()
+    """What is wrong with it for good."""

@@ -31,9 +31,9 @@ class CaptureRecord:
 
     constraint: name of the optical axis it belongs to; active_arrival: a new number each time the active arm
     arrived anew (captures that share it share that arm's error); joints: rad, mean of the readings before and after
-    the exposure; feature, corners: px in the distorted image, corners by index on the board or None; image_size:
-    width and height, px; aligned: whether the feature was within the tolerance; order_known: False where two
-    orientations of the pattern fitted.
+    the exposure; feature, corners: px in the distorted image, corners by index on the board, None for one that was not
+    seen, or None altogether; image_size: width and height, px; aligned: whether the feature was within the tolerance;
+    order_known: False where two orientations of the pattern fitted.
     """
 
     id: str
@@ -44,7 +44,7 @@ class CaptureRecord:
     active_joints: Joints
     passive_joints: Joints
     feature: Pixel
-    corners: tuple[Pixel, ...] | None
+    corners: tuple[Pixel | None, ...] | None
     image_size: tuple[int, int]
     aligned: bool = True
     order_known: bool = True
@@ -60,7 +60,7 @@ class CaptureRecord:
             "active_joints_rad": list(self.active_joints),
             "passive_joints_rad": list(self.passive_joints),
             "feature_px": list(self.feature),
-            "corners_px": None if self.corners is None else [list(corner) for corner in self.corners],
+            "corners_px": None if self.corners is None else [corner and list(corner) for corner in self.corners],
             "image_px": list(self.image_size),
             "aligned": self.aligned,
             "order": "known" if self.order_known else "unknown",
@@ -152,7 +152,7 @@ class _Entry(BaseModel):
     active_joints_rad: _Joints
     passive_joints_rad: _Joints
     feature_px: tuple[_Finite, _Finite]
-    corners_px: tuple[tuple[_Finite, _Finite], ...] | None
+    corners_px: tuple[tuple[_Finite, _Finite] | None, ...] | None
     image_px: tuple[_Size, _Size]
     aligned: Annotated[bool, Field(strict=True)] = True
     order: Literal["known", "unknown"] = "known"
@@ -231,6 +231,8 @@ def _stray_feature(entry: _Entry, feature: int | None) -> Iterator[Problem]:
     if feature is None or entry.corners_px is None or feature >= len(entry.corners_px):
         return
     corner = entry.corners_px[feature]
+    if corner is None:
+        return
     if max(abs(corner[0] - entry.feature_px[0]), abs(corner[1] - entry.feature_px[1])) > FARTHEST_FEATURE:
         yield Problem(entry.id, f"feature_px: {entry.feature_px} is not corner {feature} of corners_px, {corner}")
 

@@ -9,8 +9,8 @@ from scipy.ndimage import map_coordinates
 from dualcal_hal.camera import Image
 from dualcal_hal.transforms import Array
 
-_TO_QUADRANT = 0.3
-"""Squares from a corner to where its four squares are looked at."""
+TO_QUADRANT = 0.3
+"""Squares from a corner, in each direction, to where its four squares are looked at."""
 
 _NEAR_ENDS = np.array([0.25, 0.75])
 _BOTH_SIDES = np.array([-1.0, 1.0])
@@ -22,13 +22,13 @@ def sample(image: Image, pixels: Array) -> Array:
     return np.asarray(map_coordinates(image, [y, x], order=1, mode="nearest", output=float))
 
 
-def contrast(image: Image, homography: Array, lattice: Array) -> Array:
-    """White minus black around each lattice point, in grey levels (n,).
+def contrast(image: Image, homography: Array, lattice: Array, apart: float = TO_QUADRANT) -> Array:
+    """White minus black around each lattice point, in grey levels (n,), looked at ``apart`` squares from it.
 
     homography: (3, 3) from lattice coordinates (column, row) to px; lattice: (n, 2). The contrast has one sign
     all over a checkerboard, halves at its rim and vanishes in expectation off it.
     """
-    quadrants = _TO_QUADRANT * np.array([[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]])
+    quadrants = apart * np.array([[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]])
     places = (lattice[:, None] + quadrants).reshape(-1, 1, 2)
     pixels = np.asarray(cv2.perspectiveTransform(places, homography), dtype=float)
     grey = sample(image, pixels.reshape(-1, 4, 2))
@@ -47,7 +47,7 @@ def gap(image: Image, grid: Array) -> float:
 
 def _gap_along_rows(image: Image, grid: Array) -> float:
     start, along = grid[1:-1, :-1], grid[1:-1, 1:] - grid[1:-1, :-1]
-    across = 0.5 * _TO_QUADRANT * (grid[2:, :-1] - grid[:-2, :-1])
+    across = 0.5 * TO_QUADRANT * (grid[2:, :-1] - grid[:-2, :-1])
     on_edge = start[..., None, :] + _NEAR_ENDS[:, None] * along[..., None, :]
     beside = start[..., None, :] + 0.5 * along[..., None, :] + _BOTH_SIDES[:, None] * across[..., None, :]
     sides = sample(image, beside)
@@ -56,21 +56,25 @@ def _gap_along_rows(image: Image, grid: Array) -> float:
     return float((off / height).max())
 
 
-def edge_blur(image: Image, grid: Array, spacing: float) -> float:
+def edge_blur(image: Image, grid: Array, reach: float) -> float:
     """Gaussian sigma in px that makes edges as wide as those between the corners ``grid`` (rows, columns, 2).
 
-    From height and steepest slope of the mean profile across each edge; the median of the edges of one
-    direction, for the direction that is blurred more (motion blurs one). It includes about 0.5 px of the pixels
-    themselves; blur beyond about a third of ``spacing``, the corners' least distance in px, is underestimated.
+    From height and steepest slope of the mean profile across each edge, over ``reach`` px to both sides; the median
+    of the edges of one direction, for the direction that is blurred more (motion blurs one). It includes about 0.5 px
+    of the pixels themselves; blur beyond about 0.8 of ``reach`` is underestimated. Corners that are NaN are passed
+    over; NaN if no two neighbours are seen.
     """
-    along_rows = _edge_widths(image, grid[:, :-1].reshape(-1, 2), grid[:, 1:].reshape(-1, 2), spacing)
-    along_columns = _edge_widths(image, grid[:-1].reshape(-1, 2), grid[1:].reshape(-1, 2), spacing)
-    return float(max(np.median(along_rows), np.median(along_columns)))
+    along_rows = _edge_widths(image, grid[:, :-1].reshape(-1, 2), grid[:, 1:].reshape(-1, 2), reach)
+    along_columns = _edge_widths(image, grid[:-1].reshape(-1, 2), grid[1:].reshape(-1, 2), reach)
+    medians = [float(np.median(widths)) for widths in (along_rows, along_columns) if len(widths)]
+    return max(medians, default=float("nan"))
 
 
-def _edge_widths(image: Image, start: Array, end: Array, spacing: float) -> Array:
-    """Gaussian sigma (n,) px across the straight edges from ``start`` to ``end`` (n, 2) px."""
-    half = np.clip(np.floor(0.4 * spacing), 2.0, 10.0)
+def _edge_widths(image: Image, start: Array, end: Array, reach: float) -> Array:
+    """Gaussian sigma (k,) px across the straight edges from ``start`` to ``end`` (n, 2) px, where both are seen."""
+    seen = np.isfinite(start[:, 0] + end[:, 0])
+    start, end = start[seen], end[seen]
+    half = np.clip(np.floor(reach), 2.0, 10.0)
     across = np.arange(-half, half + 1.0)
     along = np.linspace(0.3, 0.7, 9)
     edge = end - start

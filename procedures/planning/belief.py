@@ -43,6 +43,10 @@ class Belief:
         """The same without an error to keep clear of."""
         return replace(self, placement=Placement(self.T_P_A))
 
+    def as_if_looked(self) -> Belief:
+        """The same with only the error to keep clear of that is always left after the first looks."""
+        return replace(self, placement=Placement(self.T_P_A, *LEAST_ERROR))
+
     @staticmethod
     def fitted(T_P_A: Array, T_H_E: Array, covariance: Array, source: str) -> Belief:
         """From a fit: three sigma of its covariance (12, 12), at least the error that is always allowed for."""

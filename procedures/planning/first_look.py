@@ -14,10 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualcal_hal.errors import NoPlan
+from dualcal_hal.geometry import BETWEEN_SAMPLES
 from dualcal_hal.kinematics import random_joints
-from dualcal_hal.transforms import Array, inverse, rotation_from_vector, smallest_rotation, transform
+from dualcal_hal.robot import Joints
+from dualcal_hal.transforms import Array, Mask, inverse, rotation_from_vector, smallest_rotation, transform
+from procedures.planning.advice import advice
 from procedures.planning.belief import Belief
 from procedures.planning.model import ArmModel, CellModel, Posture
+from procedures.planning.sight import in_sight
 from procedures.planning.ways import Leg, WayFinder
 
 BOARD_TILT = np.deg2rad(25.0)
@@ -27,10 +31,15 @@ two looks it is tilted by at least 20 degrees."""
 STAND_OFF_CLEARANCE = 0.25
 """Clearance (m) from which on more is worth nothing: a decimetre of base error and its lever are inside."""
 
-_FORWARD = (0.25, 0.30, 0.20, 0.35)  # m in front of its own base
+_LEAST_FORWARD, _MOST_FORWARD = 0.225, 0.425  # m in front of its own base, the middle of what is tried
+_FORWARD = (-0.025, 0.025, -0.075, 0.075)  # m from there
 _HEIGHT = (0.50, 0.45, 0.55, 0.40, 0.60)  # m above its own base
 _ROLLS = np.deg2rad([0.0, 90.0, 180.0, -90.0])
 _STARTS = 6
+_PAIRS_COMPARED = 12
+_LOOKS_COMPARED = 5
+_TILTS_PER_LOOK = 4  # a look counts for as much as so many tilts of the search
+_WAYS_TRIED = 5
 STEEPER_TILT = np.deg2rad(45.0)
 """The same (rad) for the looks after the fifth."""
 
@@ -38,6 +47,7 @@ CAMERA_LEAN = np.deg2rad(6.0)
 """The camera looks past the board's centre by this much (rad), in another direction in each look."""
 
 _GOOD_DISTANCE = 0.65  # m between camera and board
+_LEAST_APART = 1e-3  # m between the bases on the level
 _SEARCH_RINGS = np.deg2rad([12.0, 20.0])
 _CAMERA_ROLLS = np.deg2rad([40.0, 25.0, 12.0, 60.0])
 
@@ -53,30 +63,84 @@ class StandOff:
 
 
 def find_stand_off(model: CellModel, belief: Belief, ways: WayFinder, start: Posture, seed: int) -> StandOff:
-    """The posture, of those tried, with the best clearance and distance that can be reached from ``start``.
+    """The stand-off that the cell file gives, else the one with the best clearance and distance, and the way there.
 
-    Camera and board are held in front of their own bases, facing each other along the line between the bases.
-    Raises NoPlan, which names the arm that does not reach or says that no way is clear.
+    Camera and board are held in front of their own bases, facing each other along the line between the bases. Raises
+    NoPlan: for a given one that is not fit, with the reason; where none is found, with what would help; where no way
+    leads there from ``start``, with what is in the way.
     """
-    rng = np.random.default_rng([seed, 1])
-    toward_passive = _level(inverse(belief.T_P_A)[:3, 3], "bases")
-    toward_active = _level(belief.T_P_A[:3, 3], "bases")
-    q_a = _facing_postures(model.active, toward_passive, inverse(belief.T_H_E), rng)
-    q_p = _facing_postures(model.passive, toward_active, inverse(model.T_F_T), rng)
-    for arm, q in ((model.active, q_a), (model.passive, q_p)):
-        if len(q) == 0:
-            raise NoPlan(f"no stand-off: arm '{arm.name}' cannot face the other in front of its base within its limits")
-    for i, j in _by_merit(model, belief, ways, q_a, q_p):
-        posture = Posture.of(q_a[i], q_p[j])
+    if model.stand_off is not None:
+        _require_fit(model, belief, ways, model.stand_off)
+        postures = [model.stand_off]
+    else:
+        postures = _stand_offs(model, belief, ways, seed)
+    for posture in postures[:_WAYS_TRIED]:
         way = ways.find(start, posture)
         if way is not None:
-            clearance = float(ways.geometry.between([q_a[i]], [q_p[j]], belief.placement)[0])
-            T_E_T = inverse(model.camera_in_passive(q_a[i], belief)) @ model.target_in_passive(q_p[j])
-            return StandOff(posture, way, clearance, float(T_E_T[2, 3]))
+            return StandOff(posture, way, _between(ways, belief, posture), float(_T_E_T(model, belief, posture)[2, 3]))
     raise NoPlan(
-        "no stand-off: no clear way from where the arms stand to any posture in which they face each other; "
-        "jog them apart, each above its own base"
+        "no way from where the arms stand to the stand-off is clear for every error of the bases that "
+        f"nominal.uncertainty allows ({ways.blocked_by(start, postures[0])}): "
+        f"{_what_to_jog(model, ways, start, postures[0])}"
     )
+
+
+def _what_to_jog(model: CellModel, ways: WayFinder, start: Posture, goal: Posture) -> str:
+    """The arm to move by hand so that there is a way."""
+    home = model.home
+    for arm, q, instead in (
+        (model.passive, home.passive, Posture(start.active, home.passive)),
+        (model.active, home.active, Posture(home.active, start.passive)),
+    ):
+        if ways.find(instead, goal) is not None:
+            other = (model.active if arm is model.passive else model.passive).name
+            return f"jog '{arm.name}' away from '{other}', towards its home [{_degrees(q)}] deg"
+    return f"jog both arms apart, towards their homes [{_degrees(home.active)}] and [{_degrees(home.passive)}] deg"
+
+
+def _degrees(q: Joints) -> str:
+    return ", ".join(f"{angle:.0f}" for angle in np.rad2deg(q))
+
+
+def _require_fit(model: CellModel, belief: Belief, ways: WayFinder, posture: Posture) -> None:
+    for arm, q in ((model.active, posture.active), (model.passive, posture.passive)):
+        if arm.joint_margin(q) < 0:
+            joint = int(np.argmin(np.minimum(q - arm.lower, arm.upper - q))) + 1
+            raise NoPlan(
+                f"procedure.stand_off: joint {joint} of '{arm.name}' is not within its limits by limit_margin_deg"
+            )
+    clearance = float(ways.geometry.clearance([posture.active], [posture.passive], belief.placement)[0])
+    if clearance < ways.margin:
+        raise NoPlan(
+            f"procedure.stand_off: only {clearance * 1e3:.0f} mm are sure to be clear, {ways.margin * 1e3:.0f} mm are "
+            "needed whatever the error of the bases that nominal.uncertainty allows; move the arms farther apart there"
+        )
+    if not model.in_view(_T_E_T(model, belief, posture)[None])[0]:
+        raise NoPlan(
+            "procedure.stand_off: the camera does not see the whole front of the target there, by the nominal "
+            "transforms; let camera and target face each other"
+        )
+
+
+def _stand_offs(model: CellModel, belief: Belief, ways: WayFinder, seed: int) -> list[Posture]:
+    """Postures in which both face each other and all is clear, best first; NoPlan if there is none."""
+    pairs = _facing_pairs(model, belief, seed)
+    if not pairs:
+        help_ = advice(model, belief, lambda other, belief: len(_facing_pairs(other, belief, seed)))
+        raise NoPlan(
+            "no stand-off: there is no posture in which camera and target face each other in front of their own bases, "
+            "within the limits and clear for every error of the bases that nominal.uncertainty allows. "
+            f"{help_}; or give procedure.stand_off"
+        )
+    compared = pairs[:_PAIRS_COMPARED]
+    return sorted(compared, key=lambda posture: -_looks_possible(model, belief, ways, posture))
+
+
+def _looks_possible(model: CellModel, belief: Belief, ways: WayFinder, stand_off: Posture) -> int:
+    """How many tilts of the camera can search for the board from there, and how many of the looks can follow."""
+    tilts = len(list(look_postures(model, belief, ways, stand_off, 0))) - 1
+    looks = [next(look_postures(model, belief, ways, stand_off, number), None) for number in range(1, _LOOKS_COMPARED)]
+    return tilts + _TILTS_PER_LOOK * sum(look is not None for look in looks)
 
 
 def look_postures(model: CellModel, belief: Belief, ways: WayFinder, at: Posture, number: int) -> Iterator[Posture]:
@@ -89,36 +153,46 @@ def look_postures(model: CellModel, belief: Belief, ways: WayFinder, at: Posture
     T_P_T = model.target_in_passive(at.passive)
     if number == 0:
         yield at
-        for angle, azimuth in itertools.product(_SEARCH_RINGS, np.arange(8) * np.pi / 4):
-            posture = _posture(model, belief, _turned(aimed, _about(azimuth, angle)), T_P_T, at)
-            if posture is not None and _is_clear(model, belief, ways, posture):
-                yield posture
+        tilts = itertools.product(_SEARCH_RINGS, np.arange(8) * np.pi / 4)
+        cameras = np.array([_turned(aimed, _about(azimuth, angle)) for angle, azimuth in tilts])
+        yield from _clear_postures(model, belief, ways, at, cameras, np.tile(T_P_T, (len(cameras), 1, 1)))
         return
     aimed = _aimed(aimed, T_P_T[:3, 3])
     azimuth = np.pi / 4 + (number - 1) * np.pi / 2
-    angle = BOARD_TILT if number <= 4 else STEEPER_TILT
     lean = _about(azimuth + np.pi / 2, CAMERA_LEAN)
-    sign = 1.0 if number % 2 else -1.0
-    for roll in (*_CAMERA_ROLLS, *-_CAMERA_ROLLS):
-        T_P_E = _turned(aimed, lean @ rotation_from_vector([0.0, 0.0, sign * roll]))
-        posture = _posture(model, belief, T_P_E, _tilted(T_P_T, T_P_E, azimuth, angle), at)
-        if posture is not None and _is_clear(model, belief, ways, posture):
-            T_E_T = inverse(model.camera_in_passive(posture.active, belief)) @ model.target_in_passive(posture.passive)
-            if model.in_view(T_E_T[None])[0]:
-                yield posture
+    rolls = (1.0 if number % 2 else -1.0) * np.array([*_CAMERA_ROLLS, *-_CAMERA_ROLLS])
+    cameras = np.array([_turned(aimed, lean @ rotation_from_vector([0.0, 0.0, roll])) for roll in rolls])
+    angle = BOARD_TILT if number <= 4 else STEEPER_TILT
+    boards = np.array([_tilted(T_P_T, T_P_E, azimuth, angle) for T_P_E in cameras])
+    for posture in _clear_postures(model, belief, ways, at, cameras, boards):
+        if model.in_view(_T_E_T(model, belief, posture)[None])[0]:
+            yield posture
 
 
-def _posture(model: CellModel, belief: Belief, T_P_E: Array, T_P_T: Array, near: Posture) -> Posture | None:
-    flange_a = inverse(belief.T_P_A) @ T_P_E @ inverse(belief.T_H_E)
-    flange_p = T_P_T @ inverse(model.T_F_T)
-    q_a, reached_a = model.active.chain.inverse(flange_a, [near.active], model.active.lower, model.active.upper)
-    q_p, reached_p = model.passive.chain.inverse(flange_p, [near.passive], model.passive.lower, model.passive.upper)
-    return Posture.of(q_a[0], q_p[0]) if reached_a[0] and reached_p[0] else None
+def _clear_postures(
+    model: CellModel, belief: Belief, ways: WayFinder, near: Posture, cameras: Array, boards: Array
+) -> list[Posture]:
+    """Postures with camera and board at poses in P (k, 4, 4): those reached, clear and in sight."""
+    a, p = model.active, model.passive
+    flanges = inverse(belief.T_P_A) @ cameras @ inverse(belief.T_H_E), boards @ inverse(model.T_F_T)
+    starts = (np.tile(q, (len(cameras), 1)) for q in (near.active, near.passive))
+    (q_a, reached_a), (q_p, reached_p) = (
+        arm.chain.inverse(flange, start, arm.lower, arm.upper)
+        for arm, flange, start in zip((a, p), flanges, starts, strict=True)
+    )
+    clear = reached_a & reached_p
+    if np.any(clear):
+        clear[clear] = ways.geometry.clearance(q_a[clear], q_p[clear], belief.placement) >= ways.margin
+        clear[clear] = in_sight(model, q_a[clear], q_p[clear], belief)
+    return [Posture.of(q_a[k], q_p[k]) for k in np.flatnonzero(clear)]
 
 
-def _is_clear(model: CellModel, belief: Belief, ways: WayFinder, posture: Posture) -> bool:
-    clearance = ways.geometry.clearance([posture.active], [posture.passive], belief.placement)
-    return bool(clearance[0] >= model.margin)
+def _between(ways: WayFinder, belief: Belief, posture: Posture) -> float:
+    return float(ways.geometry.between([posture.active], [posture.passive], belief.placement)[0])
+
+
+def _T_E_T(model: CellModel, belief: Belief, posture: Posture) -> Array:
+    return inverse(model.camera_in_passive(posture.active, belief)) @ model.target_in_passive(posture.passive)
 
 
 def _turned(T: Array, rotation: Array) -> Array:
@@ -133,58 +207,65 @@ def _tilted(T_P_T: Array, T_P_E: Array, azimuth: float, angle: float) -> Array:
     return transform(smallest_rotation(T_P_T[:3, 2], normal) @ T_P_T[:3, :3], T_P_T[:3, 3])
 
 
-def _level(direction: Array, what: str) -> Array:
-    level = np.array([direction[0], direction[1], 0.0])
-    length = float(np.linalg.norm(level))
-    if length < 1e-3:
-        raise NoPlan(f"no stand-off: the {what} stand above each other, there is no direction in which they face")
-    return np.asarray(level / length)
-
-
-def _facing_postures(arm: ArmModel, toward: Array, T_tool_flange: Array, rng: np.random.Generator) -> Array:
-    """Joint angles (k, n) that hold the tool in front of the arm's base, its z axis towards the other arm."""
+def _facing_postures(arm: ArmModel, other: Array, T_tool_flange: Array, rng: np.random.Generator) -> Array:
+    """Joint angles (k, n) that hold the tool in front of the arm's base, its z axis towards the ``other`` base (3,)."""
     up = np.array([0.0, 0.0, 1.0])
+    apart = float(np.linalg.norm(other[:2]))
+    if apart < _LEAST_APART:
+        raise NoPlan("no stand-off: the bases stand above each other, there is no direction in which they face")
+    toward = np.array([*other[:2] / apart, 0.0])
+    middle = np.clip((apart - _GOOD_DISTANCE) / 2, _LEAST_FORWARD, _MOST_FORWARD)
     facing = np.stack([np.cross(-up, toward), -up, toward], axis=1)
-    goals = np.array(
-        [
-            transform(facing @ rotation_from_vector([0.0, 0.0, roll]), forward * toward + height * up) @ T_tool_flange
-            for forward, height, roll in itertools.product(_FORWARD, _HEIGHT, _ROLLS)
-        ]
-    )
+    tools = [
+        transform(facing @ rotation_from_vector([0.0, 0.0, roll]), (middle + forward) * toward + height * up)
+        for forward, height, roll in itertools.product(_FORWARD, _HEIGHT, _ROLLS)
+    ]
+    goals = np.array(tools) @ T_tool_flange
     starts = np.concatenate(
         [random_joints(rng, len(goals) * (_STARTS - 1), arm.lower, arm.upper), np.tile(arm.home, (len(goals), 1))]
     )
     q, reached = arm.chain.inverse(np.tile(goals, (_STARTS, 1, 1)), starts, arm.lower, arm.upper)
-    return np.asarray(arm.nearest_turn(q[reached], arm.home))
+    q = arm.nearest_turn(q[reached], arm.home)
+    _, different = np.unique(np.round(q, 3), axis=0, return_index=True)
+    return np.asarray(q[np.sort(different)])
 
 
-def _by_merit(model: CellModel, belief: Belief, ways: WayFinder, q_a: Array, q_p: Array) -> Iterator[tuple[int, int]]:
-    """Pairs of postures, best first: clear of everything, at a good distance, short of travel, with room at limits."""
-    own_a, own_p = ways.geometry.active.own_clearance(q_a), ways.geometry.passive.own_clearance(q_p)
-    q_a_index, q_p_index = np.flatnonzero(own_a >= model.margin), np.flatnonzero(own_p >= model.margin)
+def _facing_pairs(model: CellModel, belief: Belief, seed: int) -> list[Posture]:
+    """Postures that are clear of everything, at a good distance, short of travel and with room at limits come first."""
+    rng = np.random.default_rng([seed, 1])
+    q_a = _facing_postures(model.active, inverse(belief.T_P_A)[:3, 3], inverse(belief.T_H_E), rng)
+    q_p = _facing_postures(model.passive, belief.T_P_A[:3, 3], inverse(model.T_F_T), rng)
+    if not (len(q_a) and len(q_p)):
+        return []
+    geometry, margin = model.geometry, model.margin + BETWEEN_SAMPLES
+    own_a, own_p = geometry.active.own_clearance(q_a), geometry.passive.own_clearance(q_p)
     merit_a = _ease(model.active, q_a) + np.minimum(own_a, 0.1)
     merit_p = _ease(model.passive, q_p) + np.minimum(own_p, 0.1)
-    best_a = q_a_index[np.argsort(-merit_a[q_a_index], kind="stable")][:24]
-    best_p = q_p_index[np.argsort(-merit_p[q_p_index], kind="stable")][:24]
-    pairs = list(itertools.product(best_a, best_p))
+    pairs = list(itertools.product(_best(merit_a, own_a >= margin), _best(merit_p, own_p >= margin)))
     if not pairs:
-        return iter(())
+        return []
     first, second = np.array(pairs).T
-    between = ways.geometry.between(q_a[first], q_p[second], belief.placement)
+    between = geometry.between(q_a[first], q_p[second], belief.placement)
     T_E_T = inverse(model.camera_in_passive(q_a[first], belief)) @ model.target_in_passive(q_p[second])
     merit = merit_a[first] + merit_p[second] + 4 * np.minimum(between, STAND_OFF_CLEARANCE)
     merit = merit - np.abs(T_E_T[:, 2, 3] - _GOOD_DISTANCE)
-    seen = model.in_view(T_E_T) & (between >= model.margin)
-    order = np.argsort(-merit, kind="stable")
-    return iter([(int(first[k]), int(second[k])) for k in order if seen[k]])
+    fit = model.in_view(T_E_T) & (between >= margin)
+    fit[fit] = in_sight(model, q_a[first[fit]], q_p[second[fit]], belief)
+    order = _best(merit, fit)
+    return [Posture.of(q_a[first[k]], q_p[second[k]]) for k in order]
+
+
+def _best(merit: Array, fit: Mask, most: int = 24) -> list[int]:
+    """The numbers of those that are fit, the best first."""
+    return [int(k) for k in np.argsort(-merit, kind="stable") if fit[k]][:most]
 
 
 def _ease(arm: ArmModel, q: Array) -> Array:
     """Higher for postures near home and away from the limits and singularities."""
     travel = np.max(np.abs(q - arm.home), axis=1)
-    room = np.min(np.minimum(q - arm.lower, arm.upper - q), axis=1)
+    room = arm.joint_margin(q)
     smallest = np.linalg.svd(arm.chain.jacobian(q), compute_uv=False)[:, -1]
-    return np.asarray(-0.2 * travel + 0.3 * np.minimum(room, 0.5) + np.minimum(smallest, 0.1))
+    return np.asarray(-0.1 * travel + 0.3 * np.minimum(room, 0.5) + 3 * np.minimum(smallest, 0.15))
 
 
 def _about(azimuth: float, angle: float) -> Array:

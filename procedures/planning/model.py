@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,9 +13,10 @@ from numpy.typing import ArrayLike
 from dualcal_hal.camera import Intrinsics
 from dualcal_hal.config import CellConfig, RobotConfig
 from dualcal_hal.geometry import CellGeometry
+from dualcal_hal.geometry.exact import ExactCell
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.robot import Joints
-from dualcal_hal.target import Checkerboard
+from dualcal_hal.target import Target
 from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.estimation.projection import project
 from procedures.planning.belief import Belief
@@ -23,13 +27,20 @@ IMAGE_MARGIN = 20.0
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """One arm's kinematics, the limits a procedure keeps (rad) and where it rests."""
+    """One arm's kinematics, the limits a procedure keeps and where it rests.
+
+    lower, upper: (n,) rad, inside the arm's own limits by limit_margin; home: (n,) rad; speed: (n,) rad/s;
+    acceleration: (n,) rad/s^2; joint_sigma: rad.
+    """
 
     name: str
     chain: Chain
     lower: Array
     upper: Array
+    limit_margin: Array
     home: Array
+    speed: Array
+    acceleration: Array
     joint_sigma: float
 
     @staticmethod
@@ -40,17 +51,49 @@ class ArmModel:
             robot.chain,
             robot.lower + margin,
             robot.upper - margin,
+            margin,
             robot.home,
+            robot.speed,
+            robot.acceleration,
             robot.joint_sigma,
         )
 
+    def within_limits(self, q: ArrayLike) -> Mask:
+        """Which of the joint angles (..., n) are within the procedure's limits, (..., n)."""
+        q = np.asarray(q, dtype=float)
+        return np.asarray((q >= self.lower) & (q <= self.upper))
+
+    def joint_margin(self, q: ArrayLike) -> Array:
+        """How far (...,) in rad the nearest of the joint angles (..., n) is inside the procedure's limits."""
+        q = np.asarray(q, dtype=float)
+        return np.asarray(np.min(np.minimum(q - self.lower, self.upper - q), axis=-1))
+
+    def manipulability(self, q: ArrayLike) -> Array:
+        """T. Yoshikawa's measure (...,) at joint angles (..., n), sqrt(det J J^T) of the flange: m^3 for six joints.
+
+        Zero in a singular posture (Manipulability of Robotic Mechanisms, 1985).
+        """
+        J = self.chain.jacobian(q)
+        return np.asarray(np.sqrt(np.maximum(np.linalg.det(J @ np.swapaxes(J, -1, -2)), 0.0)))
+
+    def move_time(self, start: ArrayLike, goal: ArrayLike) -> Array:
+        """Seconds (...,) of straight moves between joint angles (..., n), by trapezoids of velocity from rest to rest.
+
+        The joints move in proportion: the slowest sets the pace.
+        """
+        way = np.abs(np.asarray(goal, dtype=float) - np.asarray(start, dtype=float))
+        slowest, least_gain = np.max(way / self.speed, axis=-1), np.max(way / self.acceleration, axis=-1)
+        ramp = least_gain / np.maximum(slowest, 1e-12)
+        reaches_speed = ramp <= slowest
+        return np.asarray(np.where(reaches_speed, slowest + ramp, 2 * np.sqrt(least_gain)))
+
     def nearest_turn(self, q: Array, reference: Array) -> Array:
-        """Each angle of (k, n) turned by whole turns to the one nearest to the reference within the limits."""
+        """Angles (..., n), each turned by whole turns to the one nearest to the reference within the limits."""
         turn = 2 * np.pi
         near = q - turn * np.round((q - reference) / turn)
         near = np.where(near > self.upper, near - turn, near)
         near = np.where(near < self.lower, near + turn, near)
-        return np.asarray(np.where((near > self.upper) | (near < self.lower), q, near))
+        return np.asarray(np.where(self.within_limits(near), near, q))
 
 
 @dataclass(frozen=True)
@@ -69,18 +112,32 @@ class CellModel:
     """Everything about the cell that planning needs and the cell file says, without ``simulation``."""
 
     def __init__(self, cell: CellConfig) -> None:
+        self._cell = cell
         self.active = ArmModel.of(cell.active_name, cell.active)
         self.passive = ArmModel.of(cell.passive_name, cell.passive)
         self.T_F_T: Array = cell.passive.target_mount_transform
-        self.board: Checkerboard = cell.target.board
+        self.board: Target = cell.target.board
         self.intrinsics: Intrinsics = cell.camera.intrinsics
         self.distance: tuple[float, float] = cell.procedure.distance
         self.tilt_max: float = cell.procedure.tilt_max
         self.margin: float = cell.procedure.clearance
+        given = cell.procedure.stand_off
+        self.stand_off = None if given is None else Posture.of(given.active, given.passive)
         self.nominal = Belief.nominal(cell.nominal)
         self.geometry = CellGeometry.of(cell)
         # The plate may not leave the image either: its margin helps nobody but the eye that looks for the corners.
         self._in_view = np.concatenate([self.board.corners, self.board.outline])
+
+    @cached_property
+    def exact(self) -> ExactCell:
+        """The cell in its true shapes, slow: for the final check."""
+        return ExactCell.of(self._cell)
+
+    def but(self, **changes: object) -> Self:
+        """The same cell with some of its attributes changed; its shapes stay."""
+        other = copy(self)
+        vars(other).update(changes)
+        return other
 
     @property
     def home(self) -> Posture:

@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-import numpy as np
-
 from dualcal_hal.robot import Joints
 from dualcal_hal.session.captures import Use
-from dualcal_hal.transforms import Array, vector_from_rotation
 
-PLAN_FORMAT = "dualcal.plan/1"
+PLAN_FORMAT = "dualcal.plan/2"
 
 
 @dataclass(frozen=True)
@@ -44,12 +41,25 @@ class PlannedPosition:
 
 @dataclass(frozen=True)
 class PlannedConstraint:
-    """One pose of the active arm, and positions to align with its optical axis, the farthest first."""
+    """One pose of the active arm, and positions to align with its optical axis, the farthest first.
+
+    manipulability: T. Yoshikawa's sqrt(det J J^T), m^3 for six joints; joint_margin: rad to the nearest limit that a
+    procedure keeps; both are the least of either arm at any position. seconds: the way from the constraint before,
+    the moves between the positions, and the pictures, as expected.
+    """
 
     name: str
     use: Use
     active: Joints
     positions: tuple[PlannedPosition, ...]
+    manipulability: float
+    joint_margin: float
+    seconds: float
+
+    @property
+    def clearance(self) -> float:
+        """The least of all its positions, m."""
+        return min(position.clearance for position in self.positions)
 
     def to_record(self) -> dict[str, Any]:
         return {
@@ -57,25 +67,44 @@ class PlannedConstraint:
             "use": self.use,
             "active_joints_rad": list(self.active),
             "positions": [position.to_record() for position in self.positions],
+            "manipulability": self.manipulability,
+            "joint_margin_rad": self.joint_margin,
+            "expected_s": self.seconds,
         }
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
         positions = tuple(PlannedPosition.from_record(position) for position in record["positions"])
-        return cls(record["constraint"], record["use"], tuple(record["active_joints_rad"]), positions)
+        return cls(
+            record["constraint"],
+            record["use"],
+            tuple(record["active_joints_rad"]),
+            positions,
+            record["manipulability"],
+            record["joint_margin_rad"],
+            record["expected_s"],
+        )
 
 
 @dataclass(frozen=True)
 class Plan:
     """Constraints in the order they are visited; ``refused`` counts candidates per condition that failed.
 
-    ``planned_from`` says which transforms it was planned with; a provisional plan is for showing, not for moving.
+    ``axis_spread`` is the smallest eigenvalue of the mean of z z^T over the calibration's optical axes z, with those
+    captured already; None in a plan for verification alone. ``planned_from`` says which transforms it was planned
+    with; a provisional plan is for showing, not for moving.
     """
 
     constraints: tuple[PlannedConstraint, ...]
+    axis_spread: float | None
     refused: dict[str, int]
     provisional: bool
     planned_from: str
+
+    @property
+    def seconds(self) -> float:
+        """What all constraints are expected to take."""
+        return sum(constraint.seconds for constraint in self.constraints)
 
     def of(self, use: Use) -> tuple[PlannedConstraint, ...]:
         """The constraints of one use."""
@@ -86,7 +115,8 @@ class Plan:
         names = {constraint.name for constraint in dropped}
         kept = tuple(constraint for constraint in self.constraints if constraint.name not in names)
         refused = {what: self.refused.get(what, 0) + by.refused.get(what, 0) for what in {**self.refused, **by.refused}}
-        return Plan((*kept, *by.constraints), refused, self.provisional, self.planned_from)
+        spread = self.axis_spread if by.axis_spread is None else by.axis_spread
+        return Plan((*kept, *by.constraints), spread, refused, self.provisional, self.planned_from)
 
     def to_record(self) -> dict[str, Any]:
         """The content of ``plan.json``, from which :meth:`from_record` makes the same plan to the last bit."""
@@ -95,26 +125,17 @@ class Plan:
             "provisional": self.provisional,
             "planned_from": self.planned_from,
             "constraints": [constraint.to_record() for constraint in self.constraints],
+            "axis_spread": self.axis_spread,
             "refused_candidates": self.refused,
         }
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
         constraints = tuple(PlannedConstraint.from_record(constraint) for constraint in record["constraints"])
-        return cls(constraints, record["refused_candidates"], record["provisional"], record["planned_from"])
-
-
-def turned_about_two_axes(R: Array) -> float:
-    """How far flange orientations (k, 3, 3) are turned about a second axis, in rad.
-
-    The largest angle, over pairs of relative rotations, that is left of one perpendicular to the other's axis: zero
-    if all relative rotations share one axis, when the rotation step is singular.
-    """
-    first, second = np.triu_indices(len(R), 1)
-    vectors = vector_from_rotation(np.swapaxes(R[first], 1, 2) @ R[second])
-    angles = np.linalg.norm(vectors, axis=1)
-    if not np.any(angles > 0):
-        return 0.0
-    axes = vectors / np.maximum(angles, 1e-12)[:, None]
-    sideways = np.linalg.norm(np.cross(axes[:, None], vectors[None]), axis=2)
-    return float(np.max(np.minimum(sideways, angles[:, None])))
+        return cls(
+            constraints,
+            record["axis_spread"],
+            record["refused_candidates"],
+            record["provisional"],
+            record["planned_from"],
+        )

@@ -1,45 +1,35 @@
-"""Selection of poses (paper, section 4.1): optical axes over the workspace and positions of the target along them.
-
-Poses start from random joint angles, so they spread over what the arms can reach: a random pose of the active arm
-gives an axis (step 1), eqs. (15) and (16) the positions along it (step 2, with i = 0..m-1 and a step of
-(L_max - L_min)/(m-1)), and the random pose of the passive arm nearest to such a position an orientation of the
-target within the angle constraint, eq. (13) (step 3); a few Newton steps bring the feature point onto the axis.
-"""
+"""Selection of poses: of many candidates those that tell most, in an order that can be visited quickly."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from dualcal_hal.errors import NoPlan
-from dualcal_hal.kinematics import random_joints
 from dualcal_hal.session.captures import Use
-from dualcal_hal.transforms import Array, Mask, inverse, skew
+from dualcal_hal.transforms import Array
+from procedures.planning.advice import advice
 from procedures.planning.belief import Belief
+from procedures.planning.candidates import Candidate, CandidateSource
+from procedures.planning.choice import LEAST_SPREAD, LEAST_TURN, Knowledge, most_informative
 from procedures.planning.model import ArmModel, CellModel, Posture
-from procedures.planning.plan import Plan, PlannedConstraint, PlannedPosition, turned_about_two_axes
-from procedures.planning.ways import WayFinder
+from procedures.planning.order import shortest_order
+from procedures.planning.plan import Plan, PlannedConstraint, PlannedPosition
+from procedures.planning.ways import Leg, WayFinder
 
-ROOM = 0.015
-"""The passive arm can still move this far (m) each way in the camera plane: the servo's room."""
+POINT_SECONDS = 0.5
+"""What pictures and corrections take at a position, besides the way there: two pictures, as measured."""
 
-LEAST_TURN = np.deg2rad(30.0)
-"""Flange orientations of the calibration's constraints are turned by this much about two axes (rad)."""
+_POOLS = (3, 6, 12, 24)  # candidates drawn for each constraint of a use; more where fewer do not do
+_LEAST_WHOLE = 6  # constraints that a pool is large enough for, however few are wanted
+_AXES_TRIED = 2000
+_AXES_FOR_ADVICE = 200
+_WAYS_MISSED = 8
+"""Constraints that no way leads to, after which the start or the cell is to blame and no longer the candidates."""
 
-_PASSIVE_SAMPLES = 12000
-_AXIS_SAMPLES = 3000
-_AXES_AT_ONCE = 24
-_AXES_TRIED = 1500
-_PICKS = 6  # postures of the passive arm tried for each position
-_NEIGHBOURS = 32
-_NEAR = 0.10  # m from a position within which a sampled posture is a start for it
-_NORMAL_WEIGHT = 0.15  # m per unit of direction, to measure nearness in position and direction together
-_POOL = 2.5  # candidates to choose from, per constraint wanted
+_NO_WAY = "no clear way to the constraint"
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,24 +48,25 @@ class Request:
 
 
 @dataclass(frozen=True, eq=False)
-class _Candidate:
-    active: Array
-    passive: Array  # (m, n)
-    tilt: Array
-    distance: Array
-    clearance: Array
-    information: Array  # (12, 12)
+class _Stop:
+    """A candidate with the way that leads there."""
+
+    candidate: Candidate
+    way: tuple[Leg, ...]
+    seconds: float
 
 
 class PosePlanner:
-    """Draws poses for one belief; the same seed gives the same poses."""
+    """Draws and chooses poses for one belief; the same seed gives the same poses."""
 
     def __init__(self, model: CellModel, belief: Belief, ways: WayFinder, seed: Sequence[int]) -> None:
         self._model = model
         self._belief = belief
         self._ways = ways
-        self._rng = np.random.default_rng(list(seed))
-        self.refused: Counter[str] = Counter()
+        self._source = CandidateSource(model, belief, np.random.default_rng(list(seed)))
+        self.refused = self._source.refused
+        self._straight: dict[Candidate, bool] = {}
+        self._found: dict[tuple[Posture, Posture], tuple[Leg, ...] | None] = {}
 
     def plan(self, requests: Sequence[Request], start: Posture, *, provisional: bool) -> Plan:
         """Constraints for all requests, in an order in which each can be reached from the one before.
@@ -83,294 +74,213 @@ class PosePlanner:
         Raises NoPlan, which says how many candidates failed which condition.
         """
         planned: list[PlannedConstraint] = []
-        posture = start
+        posture, spread = start, None
         for request in requests:
-            pool = self._candidates(request)
-            chosen, posture = self._reachable_choice(pool, request, posture)
-            planned += chosen
-        return Plan(tuple(planned), dict(self.refused), provisional, self._belief.source)
+            known = self._known(request.captured)
+            stops = self._select(request, known, posture)
+            posture = _end(stops[-1].candidate)
+            planned += [self._planned(stop, request, number) for number, stop in enumerate(stops)]
+            if request.use == "calibration":
+                spread = Knowledge.together([known, *(stop.candidate.knowledge for stop in stops)]).spread
+        return Plan(tuple(planned), spread, dict(self.refused), provisional, self._belief.source)
 
-    # -- candidates ---------------------------------------------------------------------------------------------
+    def _select(self, request: Request, known: Knowledge, start: Posture) -> list[_Stop]:
+        """From a pool that grows until it holds a choice that keeps all conditions."""
+        pool: list[Candidate] = []
+        drawn, whole = 0, max(_LEAST_WHOLE, request.constraints + len(request.captured))
+        for share in _POOLS:
+            new = self._source.draw(request.positions, share * whole - drawn, _AXES_TRIED)
+            drawn += len(new)
+            pool += new
+            stops = self._visitable(pool, request, known, start)
+            if stops:
+                return stops
+            if not drawn:
+                break
+        raise NoPlan(self._refusal(request, pool))
 
-    def _candidates(self, request: Request) -> list[_Candidate]:
-        wanted = int(np.ceil(_POOL * request.constraints)) + 2
-        pool: list[_Candidate] = []
-        tried = 0
-        while len(pool) < wanted and tried < _AXES_TRIED:
-            axes = self._axes()
-            for first in range(0, len(axes), _AXES_AT_ONCE):
-                batch = axes[first : first + _AXES_AT_ONCE]
-                tried += len(batch)
-                pool += self._along(batch, request.positions)
-                if len(pool) >= wanted or tried >= _AXES_TRIED:
-                    break
-            if len(axes) == 0:
-                tried += _AXIS_SAMPLES // 10
-        if len(pool) < request.constraints:
-            raise NoPlan(self._refusal(request, len(pool)))
-        return pool
-
-    def _axes(self) -> Array:
-        """Joint angles (k, n) of the active arm whose optical axis runs through what the passive arm reaches."""
-        arm = self._model.active
-        q = random_joints(self._rng, _AXIS_SAMPLES, arm.lower, arm.upper)
-        T_P_E = self._model.camera_in_passive(q, self._belief)
-        camera, axis = T_P_E[:, :3, 3], T_P_E[:, :3, 2]
-        served = np.ones(len(q), dtype=bool)
-        for distance in (self._model.distance[1], self._model.distance[0]):
-            looked_at = np.hstack([camera + distance * axis, -_NORMAL_WEIGHT * axis])
-            nearest = np.full(len(q), np.inf)
-            nearest[served] = self._library.tree.query(looked_at[served])[0]
-            served &= nearest < _NEAR
-        self.refused["the axis misses what the passive arm reaches"] += int(np.sum(~served))
-        q = q[served]
-        clear = self._ways.geometry.active.own_clearance(q) >= self._model.margin if len(q) else served[:0]
-        self.refused["the active arm is too close to itself or the floor"] += int(np.sum(~clear))
-        return np.asarray(q[clear])
-
-    def _along(self, active: Array, positions: int) -> list[_Candidate]:
-        """Those of the given axes along which the target can be shown at all positions."""
-        T_P_E = self._model.camera_in_passive(active, self._belief)
-        low, high = self._model.distance
-        distance = np.linspace(high, low, positions)
-        starts, goals, found = self._passive_starts(T_P_E, distance)
-        shape = found.shape  # (axes, positions, picks)
-        q, reached = _solve(
-            self._model.passive, self._model, goals.reshape(-1, 4, 4), starts.reshape(-1, starts.shape[-1])
-        )
-        q, reached = q.reshape(*shape, -1), reached.reshape(shape) & found
-        self._count("the passive arm does not reach the position", reached)
-        usable = reached & self._usable(active, q, T_P_E, reached)
-        shown = np.flatnonzero(np.all(np.any(usable, axis=2), axis=1))
-        if len(shown) == 0:
-            return []
-        active, T_P_E = active[shown], T_P_E[shown]
-        passive = np.stack([_least_travel(q[k], usable[k]) for k in shown])
-        roomy = self._has_room(active, passive, T_P_E)
-        self._count("no room for alignment", roomy)
-        return [self._candidate(active[k], passive[k], T_P_E[k], distance) for k in np.flatnonzero(roomy)]
-
-    def _passive_starts(self, T_P_E: Array, distance: Array) -> tuple[Array, Array, Mask]:
-        """Starts (a, m, picks, n) and target poses (a, m, picks, 4, 4) near library postures, and which exist."""
-        library, rng = self._library, self._rng
-        axis = T_P_E[:, None, :3, 2]
-        points = T_P_E[:, None, :3, 3] + distance[:, None] * axis
-        shape = points.shape[:2]
-        normal = -_tilted(np.broadcast_to(axis, points.shape), self._model.tilt_max, rng)
-        _, index = library.tree.query(np.concatenate([points, _NORMAL_WEIGHT * normal], axis=-1), k=_NEIGHBOURS)
-        near = np.linalg.norm(library.T_P_T[index, :3, 3] - points[:, :, None], axis=-1) < _NEAR
-        facing = -np.einsum("amki,ami->amk", library.T_P_T[index, :3, 2], np.broadcast_to(axis, points.shape))
-        allowed = near & (facing > np.cos(self._model.tilt_max))
-        order = np.argsort(np.where(allowed, rng.random(allowed.shape), 2.0), axis=-1)[..., :_PICKS]
-        index = np.take_along_axis(index, order, axis=-1)
-        found = np.take_along_axis(allowed, order, axis=-1)
-        self._count("no posture within the tilt allowed", np.any(found, axis=-1))
-        goals = library.T_P_T[index].copy()
-        goals[..., :3, 3] = points[:, :, None]
-        assert found.shape[:2] == shape
-        return library.q[index], goals, found
-
-    def _usable(self, active: Array, q: Array, T_P_E: Array, reached: Mask) -> Mask:
-        """Which reached postures (a, m, picks) show the target whole and keep clear."""
-        model, which = self._model, np.nonzero(reached)
-        T_E_T = inverse(T_P_E)[which[0]] @ model.target_in_passive(q[which])
-        seen = model.in_view(T_E_T)
-        self._count("the target is not wholly in view", seen)
-        own = self._ways.geometry.passive.own_clearance(q[which]) if len(which[0]) else np.zeros(0)
-        self._count("the passive arm is too close to itself or the floor", own[seen] >= model.margin)
-        good = seen & (own >= model.margin)
-        which = tuple(w[good] for w in which)
-        usable = np.zeros(reached.shape, dtype=bool)
-        if len(which[0]):
-            between = self._ways.geometry.between(active[which[0]], q[which], self._belief.placement)
-            self._count("the arms are too close to each other", between >= model.margin)
-            usable[tuple(w[between >= model.margin] for w in which)] = True
-        return usable
-
-    def _has_room(self, active: Array, passive: Array, T_P_E: Array) -> Mask:
-        """Which axes (a, n) leave room at all their positions (a, m, n) to move each way in the camera plane."""
-        model = self._model
-        steps = ROOM * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-        shifts = steps @ np.swapaxes(T_P_E[:, None, :3, :2], 2, 3)  # (a, 1, 4, 3)
-        goals = np.repeat(model.target_in_passive(passive)[:, :, None], len(steps), axis=2)
-        goals[..., :3, 3] += shifts
-        starts = np.repeat(passive[:, :, None], len(steps), axis=2)
-        q, reached = _solve(model.passive, model, goals.reshape(-1, 4, 4), starts.reshape(-1, starts.shape[-1]))
-        room = np.all(reached.reshape(len(active), -1), axis=1)
-        each = len(q) // len(active)
-        which = np.repeat(room, each)
-        own = self._ways.geometry.clearance(np.repeat(active, each, axis=0)[which], q[which], self._belief.placement)
-        room[room] = np.all(own.reshape(-1, each) >= model.margin, axis=1)
-        return np.asarray(room)
-
-    def _candidate(self, active: Array, passive: Array, T_P_E: Array, distance: Array) -> _Candidate:
-        model = self._model
-        T_P_T = model.target_in_passive(passive)
-        clearance = self._ways.geometry.clearance(active[None], passive, self._belief.placement)
-        tilt = np.arccos(np.clip(-T_P_T[:, :3, 2] @ T_P_E[:3, 2], -1.0, 1.0))
-        information = _information(T_P_E, self._belief, T_P_T[:, :3, 3])
-        return _Candidate(active, passive, tilt, distance, clearance, information)
-
-    # -- choice and order ---------------------------------------------------------------------------------------
-
-    def _reachable_choice(
-        self, pool: list[_Candidate], request: Request, start: Posture
-    ) -> tuple[list[PlannedConstraint], Posture]:
-        """The best-conditioned choice from the pool that can be visited in some order from ``start``."""
-        known = self._known(request.captured)
-        straight: dict[int, bool] = {}
-        while True:
-            chosen = _most_informative(pool, request.constraints, known)
+    def _visitable(
+        self, pool: list[Candidate], request: Request, known: Knowledge, start: Posture
+    ) -> list[_Stop] | None:
+        """The best choice from the pool in its order of visit; candidates that cannot be visited leave the pool."""
+        while len(pool) >= request.constraints:
+            chosen = self._choice(pool, request, known)
+            if chosen is None:
+                return None
             # Ways cost most to judge: only those of candidates that would be chosen are.
-            straight.update({id(c): self._is_straight(c) for c in chosen if id(c) not in straight})
-            lost, why = [c for c in chosen if not straight[id(c)]], "the way between two positions is not clear"
+            lost = [candidate for candidate in chosen if not self._is_straight(candidate)]
+            self.refused["the way between two positions is not clear"] += len(lost)
             if not lost:
-                ordered, lost, end = self._order(chosen, start)
-                why = "no clear way to the constraint"
-            if not lost:
-                break
-            self.refused[why] += len(lost)
-            pool = [candidate for candidate in pool if not any(candidate is other for other in lost)]
-            if len(pool) < request.constraints:
-                raise NoPlan(self._refusal(request, len(pool)))
-        self._require_turns(ordered, request)
-        names = range(request.first_number, request.first_number + len(ordered))
-        return [_planned(c, f"{request.use}/{i:02d}", request.use) for i, c in zip(names, ordered, strict=True)], end
+                ordered = self._in_order(chosen, start)
+                stops = self._visit(ordered, start)
+                missed = len(stops) if len(stops) < len(ordered) else self._first_too_close(stops, start)
+                if missed is None:
+                    return stops
+                lost = [ordered[missed]]
+            pool[:] = [candidate for candidate in pool if candidate not in lost]
+        return None
 
-    def _is_straight(self, candidate: _Candidate) -> bool:
+    def _choice(self, pool: Sequence[Candidate], request: Request, known: Knowledge) -> list[Candidate] | None:
+        calibrates = request.use == "calibration"
+        knowledge = [candidate.knowledge for candidate in pool]
+        numbers = most_informative(knowledge, request.constraints, known, well_spread=calibrates)
+        together = Knowledge.together([known, *(knowledge[i] for i in numbers)])
+        if calibrates and not together.well_spread:
+            self.refused["the axes of the best choice do not spread"] += together.spread < LEAST_SPREAD
+            self.refused["the flange is not turned by 30 degrees about two axes"] += together.turn < LEAST_TURN
+            return None
+        return [pool[i] for i in numbers]
+
+    def _is_straight(self, candidate: Candidate) -> bool:
         """Whether the passive arm can go straight from each position to the next."""
-        first = Posture.of(candidate.active, candidate.passive[0])
-        return self._ways.clear(self._model.passive.name, first, candidate.passive[1:])
+        if candidate not in self._straight:
+            passive = self._model.passive.name
+            self._straight[candidate] = self._ways.clear(passive, _begin(candidate), candidate.passive[1:])
+        return self._straight[candidate]
 
-    def _order(self, chosen: list[_Candidate], start: Posture) -> tuple[list[_Candidate], list[_Candidate], Posture]:
-        """Nearest first in joint space, each with a clear way from the one before; those never reached."""
-        left, ordered, posture = list(chosen), [], start
-        while left:
-            here = np.array([*posture.active, *posture.passive])
-            left.sort(key=lambda c: float(np.max(np.abs(np.concatenate([c.active, c.passive[0]]) - here))))
-            for candidate in left:
-                if self._ways.find(posture, Posture.of(candidate.active, candidate.passive[0])) is not None:
-                    break
-            else:
+    # -- order --------------------------------------------------------------------------------------------------
+
+    def _in_order(self, chosen: Sequence[Candidate], start: Posture) -> list[Candidate]:
+        """By the seconds that straight moves from one to the next take."""
+        a, p = self._model.active, self._model.passive
+        active = np.array([candidate.active for candidate in chosen])
+        begin, end = (np.array([candidate.passive[i] for candidate in chosen]) for i in (0, -1))
+
+        def seconds(arm: ArmModel, here: Array, there: Array) -> Array:
+            return arm.move_time(here, arm.nearest_turn(there, here))
+
+        first = seconds(a, np.array(start.active), active) + seconds(p, np.array(start.passive), begin)
+        between = seconds(a, active[:, None], active) + seconds(p, end[:, None], begin)
+        return [chosen[i] for i in shortest_order(first, between)]
+
+    def _visit(self, ordered: Sequence[Candidate], start: Posture) -> list[_Stop]:
+        """The candidates with the ways that lead there, up to one that no way leads to."""
+        stops: list[_Stop] = []
+        posture = start
+        for candidate in ordered:
+            turned = self._turned(candidate, posture)
+            leads = posture, _begin(turned)
+            if leads not in self._found:
+                self._found[leads] = self._ways.find(*leads)
+            way = self._found[leads]
+            if way is None:
+                self._way_missed(*leads)
                 break
-            left = [other for other in left if other is not candidate]
-            ordered.append(candidate)
-            posture = Posture.of(candidate.active, candidate.passive[-1])
-        return ordered, left, posture
+            stops.append(_Stop(turned, way, self._ways.travel(posture, way)))
+            posture = _end(turned)
+        return stops
 
-    def _known(self, captured: Sequence[PlannedConstraint]) -> Array:
-        """What captured constraints tell already, (12, 12)."""
-        model, total = self._model, np.zeros((12, 12))
-        for constraint in captured:
-            T_P_E = model.camera_in_passive(constraint.active, self._belief)
-            distances = np.array([[position.distance] for position in constraint.positions])
-            total += _information(T_P_E, self._belief, T_P_E[:3, 3] + distances * T_P_E[:3, 2])
-        return total
+    def _turned(self, candidate: Candidate, near: Posture) -> Candidate:
+        """The same poses with joints turned by whole turns to where the way from ``near`` is shortest."""
+        active, passive = self._model.active, self._model.passive
+        turn = passive.nearest_turn(candidate.passive[0], np.array(near.passive)) - candidate.passive[0]
+        inside = np.all(passive.within_limits(candidate.passive + turn), axis=0)
+        return replace(
+            candidate,
+            active=active.nearest_turn(candidate.active, np.array(near.active)),
+            passive=candidate.passive + np.where(inside, turn, 0.0),
+        )
 
-    def _require_turns(self, chosen: list[_Candidate], request: Request) -> None:
-        if request.use != "calibration":
-            return
-        active = np.array([*(constraint.active for constraint in request.captured), *(c.active for c in chosen)])
-        R = self._model.active.chain.forward(active)[:, :3, :3]
-        turned = turned_about_two_axes(R)
-        if turned < LEAST_TURN:
-            self.refused["the flange is not turned by 30 degrees about two axes"] += 1
-            raise NoPlan(self._refusal(request, 0))
+    def _way_missed(self, start: Posture, goal: Posture) -> None:
+        self.refused[_NO_WAY] += 1
+        if self.refused[_NO_WAY] > _WAYS_MISSED:
+            raise NoPlan(
+                f"no plan: {self.refused[_NO_WAY]} constraints that no clear way leads to, the last one because "
+                f"{self._ways.blocked_by(start, goal)}"
+            )
 
-    def _count(self, condition: str, kept: Mask) -> None:
-        self.refused[condition] += int(kept.size - np.sum(kept))
+    # -- final check --------------------------------------------------------------------------------------------
 
-    def _refusal(self, request: Request, found: int) -> str:
+    def _first_too_close(self, stops: Sequence[_Stop], start: Posture) -> int | None:
+        """The number of the first stop that is not clear in the true shapes, at its positions or on the way there."""
+        here = start
+        # Who stands closer than told at first may leave.
+        least = min(self._model.margin, self._exact_clearance(start))
+        for number, stop in enumerate(stops):
+            c = stop.candidate
+            postures = [*self._closest(here, stop.way), *(Posture.of(c.active, q) for q in c.passive)]
+            if min(map(self._exact_clearance, postures)) < least:
+                self.refused["too close in the true shapes"] += 1
+                return number
+            here = _end(c)
+        return None
+
+    def _exact_clearance(self, posture: Posture) -> float:
+        return self._model.exact.clearance(posture.active, posture.passive, self._belief.T_P_A)
+
+    def _closest(self, start: Posture, way: Sequence[Leg]) -> Iterator[Posture]:
+        """Of each leg the checked posture with the least clearance."""
+        geometry, here = self._model.geometry, start
+        for leg in way:
+            moves_active = leg.arm == self._model.active.name
+            own, other = (here.active, here.passive) if moves_active else (here.passive, here.active)
+            body = geometry.active if moves_active else geometry.passive
+            path = body.sampled([own, *leg.waypoints])
+            standing = np.array([other])
+            q_a, q_p = (path, standing) if moves_active else (standing, path)
+            closest = path[int(np.argmin(geometry.clearance(q_a, q_p, self._belief.placement)))]
+            yield Posture.of(closest, other) if moves_active else Posture.of(other, closest)
+            here = Posture(leg.goal, other) if moves_active else Posture(other, leg.goal)
+
+    # -- what comes of it ---------------------------------------------------------------------------------------
+
+    def _known(self, captured: Sequence[PlannedConstraint]) -> Knowledge:
+        return Knowledge.together(
+            [
+                Knowledge.of(
+                    self._model.active.chain.forward(constraint.active),
+                    self._belief,
+                    np.array([position.distance for position in constraint.positions]),
+                )
+                for constraint in captured
+            ]
+        )
+
+    def _planned(self, stop: _Stop, request: Request, number: int) -> PlannedConstraint:
+        c, a, p = stop.candidate, self._model.active, self._model.passive
+        positions = tuple(
+            PlannedPosition(tuple(map(float, q)), float(d), float(t), float(least))
+            for q, d, t, least in zip(c.passive, c.distance, c.tilt, c.clearance, strict=True)
+        )
+        along = float(np.sum(p.move_time(c.passive[:-1], c.passive[1:])))
+        return PlannedConstraint(
+            f"{request.use}/{request.first_number + number:02d}",
+            request.use,
+            tuple(map(float, c.active)),
+            positions,
+            min(float(a.manipulability(c.active)), float(np.min(p.manipulability(c.passive)))),
+            min(float(a.joint_margin(c.active)), float(np.min(p.joint_margin(c.passive)))),
+            stop.seconds + along + POINT_SECONDS * len(positions),
+        )
+
+    def _refusal(self, request: Request, pool: Sequence[Candidate]) -> str:
+        few = len(pool) < request.constraints
+        known = self._known(request.captured)
+
+        def success(model: CellModel, belief: Belief) -> float:
+            source = CandidateSource(model, belief, np.random.default_rng(0))
+            drawn = source.draw(request.positions, _AXES_TRIED, _AXES_FOR_ADVICE)
+            return len(drawn) if few else _spread_of_best(drawn, request.constraints, known)
+
         counts = "; ".join(f"{what}: {count}" for what, count in self.refused.most_common() if count)
         return (
-            f"no plan: {found} of {request.constraints} {request.use} constraints with {request.positions} positions "
-            f"found. Candidates that failed a condition: {counts}"
+            f"no plan: {len(pool)} candidates for {request.constraints} {request.use} constraints with "
+            f"{request.positions} positions{'' if few else ', and no choice of them will do'}. Refused: {counts}. "
+            f"{advice(self._model, self._belief, success)}"
         )
 
-    @cached_property
-    def _library(self) -> _Library:
-        arm = self._model.passive
-        q = random_joints(self._rng, _PASSIVE_SAMPLES, arm.lower, arm.upper)
-        return _Library(q, self._model.target_in_passive(q))
+
+def _spread_of_best(drawn: Sequence[Candidate], count: int, known: Knowledge) -> float:
+    """How near the best choice comes to being well spread; 1 where it is."""
+    pool = [candidate.knowledge for candidate in drawn]
+    chosen = most_informative(pool, count, known, well_spread=True)
+    together = Knowledge.together([known, *(pool[i] for i in chosen)])
+    return min(together.spread / LEAST_SPREAD, together.turn / LEAST_TURN) if len(chosen) == count else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Library:
-    """Random postures of the passive arm, found by where the target is and which way it faces."""
-
-    q: Array
-    T_P_T: Array
-
-    @cached_property
-    def tree(self) -> cKDTree:
-        return cKDTree(np.hstack([self.T_P_T[:, :3, 3], _NORMAL_WEIGHT * self.T_P_T[:, :3, 2]]))
+def _begin(candidate: Candidate) -> Posture:
+    return Posture.of(candidate.active, candidate.passive[0])
 
 
-def _solve(arm: ArmModel, model: CellModel, T_P_T: Array, starts: Array) -> tuple[Array, Mask]:
-    goals = T_P_T @ inverse(model.T_F_T)
-    return arm.chain.inverse(goals, starts, arm.lower, arm.upper, iterations=12)
-
-
-def _tilted(axis: Array, largest: float, rng: np.random.Generator) -> Array:
-    """Directions (..., 3) turned away by random angles up to ``largest``, uniform on the cap."""
-    cosine = rng.uniform(np.cos(largest), 1.0, axis.shape[:-1])
-    azimuth = rng.uniform(0.0, 2 * np.pi, axis.shape[:-1])
-    helper = np.where(np.abs(axis[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    u = np.cross(axis, helper)
-    u /= np.linalg.norm(u, axis=-1, keepdims=True)
-    v = np.cross(axis, u)
-    sine = np.sqrt(1.0 - cosine**2)
-    sideways = np.cos(azimuth)[..., None] * u + np.sin(azimuth)[..., None] * v
-    return np.asarray(cosine[..., None] * axis + sine[..., None] * sideways)
-
-
-def _least_travel(q: Array, usable: Mask) -> Array:
-    """Of usable postures (m, picks, n) one each, (m, n), with the least largest joint travel from one to the next."""
-    positions = len(q)
-    cost = np.where(usable[0], 0.0, np.inf)
-    came_from = np.zeros(usable.shape, dtype=int)
-    for i in range(1, positions):
-        travel = np.max(np.abs(q[i][None] - q[i - 1][:, None]), axis=2) + cost[:, None]
-        came_from[i] = np.argmin(travel, axis=0)
-        cost = np.where(usable[i], np.min(travel, axis=0), np.inf)
-    pick = int(np.argmin(cost))
-    picks = [pick]
-    for i in range(positions - 1, 0, -1):
-        pick = int(came_from[i, pick])
-        picks.append(pick)
-    return np.stack([q[i, pick] for i, pick in enumerate(reversed(picks))])
-
-
-def _information(T_P_E: Array, belief: Belief, points: Array) -> Array:
-    """What points (m, 3) in P, aligned with one axis, tell of both transforms: (12, 12), per m^2.
-
-    Rows are the feature's offsets across the axis; columns right perturbations of T_P_A, then of T_H_E
-    (translation in m, rotation in rad). Ten directions are seen; the paper's gauge is the other two.
-    """
-    in_camera = (points - T_P_E[:3, 3]) @ T_P_E[:3, :3]
-    T_E_A = inverse(T_P_E) @ belief.T_P_A
-    in_base = in_camera @ T_E_A[:3, :3] - T_E_A[:3, :3].T @ T_E_A[:3, 3]
-    base = np.concatenate([np.broadcast_to(-np.eye(3), (len(points), 3, 3)), skew(in_base)], axis=2)
-    camera = np.concatenate([np.broadcast_to(-np.eye(3), (len(points), 3, 3)), skew(in_camera)], axis=2)
-    J = np.concatenate([T_E_A[:3, :3] @ base, camera], axis=2)[:, :2].reshape(-1, 12)
-    return np.asarray(J.T @ J)
-
-
-def _most_informative(pool: list[_Candidate], count: int, known: Array) -> list[_Candidate]:
-    """Greedy choice by the determinant of the information (D-optimality) on top of what is known already."""
-    total = known + 1e-3 * np.eye(12)
-    left, chosen = list(pool), []
-    for _ in range(min(count, len(left))):
-        gains = np.linalg.slogdet(total + np.stack([c.information for c in left]))[1]
-        best = left.pop(int(np.argmax(gains)))
-        total = total + best.information
-        chosen.append(best)
-    return chosen
-
-
-def _planned(candidate: _Candidate, name: str, use: Use) -> PlannedConstraint:
-    positions = tuple(
-        PlannedPosition(tuple(map(float, q)), float(d), float(t), float(c))
-        for q, d, t, c in zip(candidate.passive, candidate.distance, candidate.tilt, candidate.clearance, strict=True)
-    )
-    return PlannedConstraint(name, use, tuple(map(float, candidate.active)), positions)
+def _end(candidate: Candidate) -> Posture:
+    return Posture.of(candidate.active, candidate.passive[-1])

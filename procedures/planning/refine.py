@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dualcal_hal.geometry import Placement
 from dualcal_hal.robot import Joints
 from dualcal_hal.transforms import Array
 from procedures.detection import board_poses
@@ -17,12 +18,15 @@ from procedures.planning.model import CellModel
 WORST_FIT = 3.0
 """px rms above which the views do not belong to one cell: the board, its mount or the arms are not as told."""
 
+LEAST_VIEWS = 3
+"""Below so many views a fit may be in a wrong minimum, and what is kept clear of is the nominal's error."""
+
 _DETECTION_SIGMA = 0.02  # px; far below what the joints' noise does in the image
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A board seen: both arms' joint angles (rad) and the corners (n, 2) in px."""
+    """A board seen: both arms' joint angles (rad) and the corners (n, 2) in px, NaN for one that was not seen."""
 
     active: Joints
     passive: Joints
@@ -30,7 +34,10 @@ class View:
 
 
 def refine(model: CellModel, views: Sequence[View]) -> tuple[Belief, float]:
-    """The belief that explains the views, and its rms in px per axis."""
+    """The belief that explains the views, and its rms in px per axis.
+
+    The error that it keeps clear of is the fit's, or the nominal placement's while that says more.
+    """
     corners = np.stack([view.corners for view in views])
     # Only few views need starts of their own; with many the nominal has been left behind long ago.
     starts = [np.stack([T for T, _ in board_poses(view.corners, model.board, model.intrinsics)]) for view in views[:5]]
@@ -45,7 +52,16 @@ def refine(model: CellModel, views: Sequence[View]) -> tuple[Belief, float]:
         float(np.hypot(_DETECTION_SIGMA, arrival_scatter(model))),
         [*starts, *([None] * (len(views) - len(starts)))],
     )
-    return Belief.fitted(fit.T_P_A, fit.T_H_E, fit.covariance, f"{len(views)} views"), fit.rms
+    belief = Belief.fitted(fit.T_P_A, fit.T_H_E, fit.covariance, f"{len(views)} views")
+    nominal = model.nominal.placement
+    if len(views) < LEAST_VIEWS or _error_at_a_metre(belief.placement) > _error_at_a_metre(nominal):
+        belief = replace(belief, placement=nominal)
+    return belief, fit.rms
+
+
+def _error_at_a_metre(placement: Placement) -> float:
+    """How far a point that far from the pivot may be off, m."""
+    return placement.translation + placement.rotation
 
 
 def arrival_scatter(model: CellModel) -> float:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dualcal_hal.geometry import CellGeometry, interpolate
+from dualcal_hal.geometry import CellGeometry
 from dualcal_hal.robot import Joints
+from dualcal_hal.transforms import Array
 from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel, Posture
+from procedures.planning.moves import Mover
+from procedures.planning.search import Search
 
 
 @dataclass(frozen=True)
@@ -28,67 +32,92 @@ class Leg:
 
 
 class WayFinder:
-    """Finds ways that keep the clearance, for one belief."""
+    """Finds ways that keep the clearance, for one belief.
+
+    ``margin`` (m) is what checked postures keep clear, so that what lies between them keeps the procedure's clearance.
+    """
 
     def __init__(self, model: CellModel, belief: Belief, retreats: Iterable[Posture]) -> None:
-        self._model = model
-        self._placement = belief.placement
         self.geometry: CellGeometry = model.geometry
-        self._retreats = tuple(retreats)
+        movers = Mover.both(model, belief.placement)
+        self.margin = movers[0].margin
+        self._movers = {mover.arm.name: mover for mover in movers}
+        points = [_point(posture) for posture in retreats]
+        self._together = Search(movers, belief.placement, points)
+        self._alone = [Search([replace(mover, is_alone=True)], belief.placement, points) for mover in movers]
 
     def find(self, start: Posture, goal: Posture) -> tuple[Leg, ...] | None:
-        """Legs from start to goal, or None if no order of straight moves keeps clear.
+        """Legs from start to goal, or None if no way was found that keeps clear.
 
-        Tried in turn: either arm first, then one or both by way of a retreat. An arm that stands at its goal stays
-        there: leaving it would make it arrive anew.
+        Straight where that is free, else searched for: by way of a retreat, then by random points. An arm that stands
+        at its goal stays there: leaving it would make it arrive anew. The same query has the same answer, whatever was
+        asked before.
         """
-        stays = {
-            arm
-            for arm, here, there in (
-                (self._model.active.name, start.active, goal.active),
-                (self._model.passive.name, start.passive, goal.passive),
-            )
-            if here == there
-        }
-        for candidate in self._candidates(start, goal):
-            way = tuple(leg for leg in candidate if leg.arm not in stays)
-            if self._way_clear(start, way):
-                return way
-        return None
+        here, there = _point(start), _point(goal)
+        movers = self._together.moving(here, there)
+        if not all(mover.is_within_limits(there) for mover in movers):
+            return None
+        path = self._together.straight(here, there)
+        if path is None and all(mover.is_clear(there) for mover in movers) and self._can_alone(here, there):
+            path = self._together.around(here, there)
+        return None if path is None else self._legs(path)
 
     def clear(self, arm: str, start: Posture, waypoints: ArrayLike) -> bool:
         """Whether one arm's straight moves from ``start`` through waypoints (k, n) keep clear, the other standing."""
-        if arm == self._model.active.name:
-            path = interpolate(np.vstack([start.active, waypoints]))
-            own = self.geometry.active.own_clearance(path)
-            between = self.geometry.between(path, [start.passive], self._placement)
-        else:
-            path = interpolate(np.vstack([start.passive, waypoints]))
-            own = self.geometry.passive.own_clearance(path)
-            between = self.geometry.between([start.active], path, self._placement)
-        clearance = np.minimum(own, between)
-        # An arm that stands closer than the margin, because the belief has changed, may leave but come no closer.
-        return bool(np.all(clearance >= min(self._model.margin, clearance[0])))
+        ends = np.asarray(waypoints, dtype=float)
+        path = np.tile(_point(start), (len(ends) + 1, 1))
+        path[1:, self._movers[arm].axes] = ends
+        return self._together.is_free(path)
 
-    def _candidates(self, start: Posture, goal: Posture) -> Iterator[tuple[Leg, ...]]:
-        a, p = self._model.active.name, self._model.passive.name
-        to_a, to_p = Leg(a, (goal.active,)), Leg(p, (goal.passive,))
-        yield (to_a, to_p)
-        yield (to_p, to_a)
-        for retreat in self._retreats:
-            back_a, back_p = Leg(a, (retreat.active,)), Leg(p, (retreat.passive,))
-            yield (back_p, to_a, to_p)
-            yield (back_a, to_p, to_a)
-            yield (back_p, back_a, to_a, to_p)
-            yield (back_a, back_p, to_p, to_a)
+    def clearance_along(self, start: Posture, way: Iterable[Leg]) -> float:
+        """Least clearance in m, whatever the bases' error, of the checked postures of a way; inf if nothing moves."""
+        least = np.inf
+        for mover, point, waypoints in self._walk(start, way):
+            least = min(least, float(np.min(mover.clearances(mover.samples(waypoints), point))))
+        return least
 
-    def _way_clear(self, start: Posture, way: tuple[Leg, ...]) -> bool:
-        posture = start
+    def travel(self, start: Posture, way: Iterable[Leg]) -> float:
+        """Seconds that the arms need for a way, at rest at each of its waypoints."""
+        return sum(mover.duration(waypoints) for mover, _, waypoints in self._walk(start, way))
+
+    def blocked_by(self, start: Posture, goal: Posture) -> str:
+        """What is in the way of the straight moves from start to goal, for each order of the arms; "" if nothing."""
+        here, there = _point(start), _point(goal)
+        beyond = [m.arm.name for m in self._together.moving(here, there) if not m.is_within_limits(there)]
+        if beyond:
+            return f"the goal of '{beyond[0]}' is outside its limits"
+        return "; ".join(filter(None, map(self._obstruction, self._together.direct(here, there))))
+
+    def _can_alone(self, here: Array, there: Array) -> bool:
+        """Whether each arm could go there if the other were not: most goals without a way fail here, and sooner."""
+        return all(search.connects(here, there) for search in self._alone)
+
+    def _obstruction(self, path: Array) -> str:
+        """The first move of a path that is not free, and what it comes close to."""
+        before = ""
+        for mover, here, there in self._together.moves(path):
+            samples = mover.samples([here[mover.axes], there[mover.axes]])
+            if mover.free_samples(samples, here) < len(samples):
+                least, what = mover.closest(samples, here)
+                how = f"comes within {least * 1e3:.0f} mm of" if least > 0 else "may touch"
+                return f"{before}'{mover.arm.name}' {how} {what}"
+            before = f"after '{mover.arm.name}' has moved, "
+        return ""
+
+    def _walk(self, start: Posture, way: Iterable[Leg]) -> Iterator[tuple[Mover, Array, Array]]:
+        """Who moves, the point before it, and its waypoints (w, n) from there, for each leg."""
+        point = _point(start)
         for leg in way:
-            if not self.clear(leg.arm, posture, leg.waypoints):
-                return False
-            if leg.arm == self._model.active.name:
-                posture = Posture(leg.goal, posture.passive)
-            else:
-                posture = Posture(posture.active, leg.goal)
-        return True
+            mover = self._movers[leg.arm]
+            yield mover, point, np.array([point[mover.axes], *leg.waypoints])
+            point = point.copy()
+            point[mover.axes] = leg.goal
+
+    def _legs(self, path: Array) -> tuple[Leg, ...]:
+        moves = [(mover.arm.name, tuple(map(float, to[mover.axes]))) for mover, _, to in self._together.moves(path)]
+        runs = itertools.groupby(moves, key=lambda move: move[0])
+        return tuple(Leg(arm, tuple(waypoint for _, waypoint in run)) for arm, run in runs)
+
+
+def _point(posture: Posture) -> Array:
+    return np.array([*posture.active, *posture.passive])

@@ -48,7 +48,7 @@ def draw_frame(
 
 
 def _draw_board(axes: Axes, image: Image, shown: CaptureRecord, centre: Array) -> None:
-    corners = np.array(shown.corners or [shown.feature]) - centre
+    corners = np.array([corner for corner in shown.corners or () if corner] or [shown.feature]) - centre
     half = max(_SMALLEST_VIEW, _AROUND_CORNERS * float(np.abs(corners).max()))
     height, width = image.shape
     left, top = -0.5 - centre

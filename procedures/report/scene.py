@@ -47,7 +47,7 @@ def draw_scene(
     )
     axes.patch.set_visible(False)
 
-    reached = {(c.constraint, c.position): _feature_point(cell, c.passive_joints) for c in captures}
+    reached = {(c.constraint, c.position): feature_point(cell, c.passive_joints) for c in captures}
     planned = {} if plan is None else _planned(cell, plan)
     _draw_arms(axes, cell, result, shown)
     _draw_axes(axes, cell, captures, result, reached)
@@ -58,7 +58,7 @@ def draw_scene(
     head(panel, _title(planned, reached), axes)
 
 
-def _feature_point(cell: CellConfig, joints: Joints) -> Array:
+def feature_point(cell: CellConfig, joints: Joints) -> Array:
     """(3,) m in P at the passive arm's joint angles (rad)."""
     passive = cell.passive
     return np.asarray((passive.chain.forward(joints) @ passive.target_mount_transform)[:3, 3])
@@ -66,7 +66,7 @@ def _feature_point(cell: CellConfig, joints: Joints) -> Array:
 
 def _planned(cell: CellConfig, plan: Plan) -> Positions:
     return {
-        (constraint.name, number): _feature_point(cell, position.passive)
+        (constraint.name, number): feature_point(cell, position.passive)
         for constraint in plan.constraints
         for number, position in enumerate(constraint.positions)
     }
@@ -104,9 +104,9 @@ def _draw_arms(axes: Axes3D, cell: CellConfig, result: Result, shown: CaptureRec
     """Both arms with what they carry, as at a capture: the camera with its field of view, the target's outline."""
     T_P_E = result.T_P_A @ cell.active.chain.forward(shown.active_joints) @ result.T_H_E
     T_P_T = cell.passive.chain.forward(shown.passive_joints) @ cell.passive.target_mount_transform
-    active = apply(result.T_P_A, _course(cell.active.chain, shown.active_joints))
-    passive = _course(cell.passive.chain, shown.passive_joints)
-    camera = np.vstack([active[-1], apply(T_P_E, _field_of_view(cell))])
+    active = apply(result.T_P_A, arm_course(cell.active.chain, shown.active_joints))
+    passive = arm_course(cell.passive.chain, shown.passive_joints)
+    camera = np.vstack([active[-1], apply(T_P_E, field_of_view(cell))])
     target = apply(T_P_T, cell.target.board.outline[[0, 1, 2, 3, 0]])
     for base, words, course, tool, colour in (
         ("A", f"active arm ({cell.active_name})", active, camera, ORANGE),
@@ -119,7 +119,7 @@ def _draw_arms(axes: Axes3D, cell: CellConfig, result: Result, shown: CaptureRec
         axes.plot(x, y, z, color=colour, linewidth=2)
 
 
-def _course(chain: Chain, q: Joints) -> Array:
+def arm_course(chain: Chain, q: Joints) -> Array:
     """Corners (k, 3) of the arm in its base, m: along each joint's axis by d, then to the next frame's origin."""
     frames = chain.frames(q)
     points = [frames[0, :3, 3]]
@@ -128,7 +128,7 @@ def _course(chain: Chain, q: Joints) -> Array:
     return np.array(points)
 
 
-def _field_of_view(cell: CellConfig) -> Array:
+def field_of_view(cell: CellConfig) -> Array:
     """A line (k, 3) in E, m, about the pyramid that the camera sees."""
     width, height = cell.camera.size_px
     pixels = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]])

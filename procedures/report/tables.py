@@ -13,6 +13,7 @@ from rich.text import Text
 from dualcal_hal.config import CellConfig
 from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Mismatch, Result, TruthError
 from dualcal_hal.transforms import Array
+from procedures.planning.choice import LEAST_SPREAD
 from procedures.planning.plan import Plan, PlannedConstraint
 from procedures.planning.ways import Leg
 from procedures.report.nominal_errors import (
@@ -84,24 +85,35 @@ def outcome(result: Result) -> Text:
 
 
 def plan_table(plan: Plan) -> Table:
-    """One line a constraint: how far, how tilted and how clear its positions are."""
+    """One line a constraint: how far, how tilted and how clear its positions are, and what else the plan says of it."""
     title = f"{'Provisional plan' if plan.provisional else 'Plan'}, from {plan.planned_from}"
-    headers = ["constraint", "positions", "distance mm", "tilt deg", "clearance mm"]
+    headers = [
+        "constraint",
+        "points",
+        "distance\nmm",
+        "tilt\ndeg",
+        "clear\nmm",
+        "manip.\ndm^3",
+        "to limit\ndeg",
+        "time\ns",
+    ]
     table = _table(title, *headers)
     for use in dict.fromkeys(constraint.use for constraint in plan.constraints):
         for constraint in plan.of(use):
             table.add_row(*_plan_row(constraint))
         table.add_section()
+    table.caption = Text("\n".join(_plan_notes(plan)))
     return table
 
 
 def way_table(legs: Sequence[Leg]) -> Table:
-    """The moves of a way in their order, each to its joint angles."""
+    """The moves of a way in their order, each with the joint angles it passes and ends at."""
     joints = max((len(leg.goal) for leg in legs), default=0)
     table = _table("Way, joints in deg", "move", "arm", *(f"q{i}" for i in range(1, joints + 1)))
     for number, leg in enumerate(legs, start=1):
-        angles = (f"{angle:.1f}" for angle in np.degrees(leg.goal))
-        table.add_row(str(number), Text(leg.arm), *angles)
+        for i, waypoint in enumerate(leg.waypoints):
+            angles = (f"{angle:.1f}" for angle in np.degrees(waypoint))
+            table.add_row(str(number) if i == 0 else "", Text(leg.arm), *angles)
     return table
 
 
@@ -173,11 +185,21 @@ def _plan_row(constraint: PlannedConstraint) -> list[RenderableType]:
     positions = constraint.positions
     distances = [1e3 * position.distance for position in positions]
     tilts = [float(np.degrees(position.tilt)) for position in positions]
-    clearance = 1e3 * min(position.clearance for position in positions)
     return [
         Text(constraint.name),
         str(len(positions)),
-        f"{max(distances):.0f} to {min(distances):.0f}",
-        f"{min(tilts):.0f} to {max(tilts):.0f}",
-        f"{clearance:.0f}",
+        f"{max(distances):.0f}-{min(distances):.0f}",
+        f"{min(tilts):.0f}-{max(tilts):.0f}",
+        f"{1e3 * constraint.clearance:.0f}",
+        f"{1e3 * constraint.manipulability:.1f}",
+        f"{np.degrees(constraint.joint_margin):.0f}",
+        f"{constraint.seconds:.1f}",
     ]
+
+
+def _plan_notes(plan: Plan) -> Iterator[str]:
+    yield f"About {plan.seconds:.0f} s in all: ways, moves between the points, and pictures."
+    if plan.axis_spread is not None:
+        yield f"Spread of the axes {plan.axis_spread:.3f}: least eigenvalue of mean(z z^T), at least {LEAST_SPREAD:g}."
+    yield "clear: whatever the bases' error; manip.: sqrt(det J J^T); to limit: of the"
+    yield "joint nearest to the limits a procedure keeps. Each is the least of both arms."

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +51,10 @@ class Rig:
         return tuple((self.config.home + offset).tolist())
 
 
-def _simulator() -> Rig:
-    cell, folded = _paper_cell(), _paper_cell("camera.distortion=[-2, 0, 0, 0, 0]")
+def _simulator(stepper: str, unrest: float) -> Rig:
+    """``unrest``: rad that an arm which has settled may stand from its target."""
+    chosen = f"simulation.stepper={stepper}"
+    cell, folded = _paper_cell(chosen), _paper_cell(chosen, "camera.distortion=[-2, 0, 0, 0, 0]")
     noise = _simulation_noise(cell)
     return Rig(
         backend=SimulatorBackend("sim", cell),
@@ -61,7 +63,7 @@ def _simulator() -> Rig:
         robot_name=cell.cell.active_name,
         camera_name="camera",
         timeout=30.0,
-        repeatability=float(12 * noise),
+        repeatability=float(12 * noise) + unrest,
     )
 
 
@@ -75,4 +77,7 @@ def _simulation_noise(cell: CellFile) -> float:
     return float(np.sqrt(2) * cell.simulation.noise.encoder)
 
 
-RIGS: dict[str, Callable[[], Rig]] = {"simulator": _simulator}
+RIGS: dict[str, Callable[[], Rig]] = {
+    "simulator, kinematic": partial(_simulator, "kinematic", 0.0),
+    "simulator, bullet": partial(_simulator, "bullet", 2e-5),
+}

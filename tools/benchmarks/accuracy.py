@@ -24,13 +24,17 @@ from tools.cli.run import conclude, execute
 
 @dataclass(frozen=True)
 class Run:
-    """One run's figures: mismatch and translation in mm, rotation in deg, frames for each point, points given up."""
+    """One run's figures: mismatch and translation in mm, rotation in deg, frames for each point, points given up.
+
+    ``later_frames``: those of the points from the fourth constraint on.
+    """
 
     seed: int
     mismatch: float
     translation: float
     rotation: float
     frames: tuple[int, ...]
+    later_frames: tuple[int, ...]
     given_up: int
     verdict: str
 
@@ -48,6 +52,7 @@ def run(path: Path, seed: int, overrides: list[str]) -> Run:
         session = Session.create(Path(folder) / "session", file.text)
         execute(Cell(file), Calibration(file.cell, CellModel(file.cell)), session, collect)
         result = conclude(file, session, captures_of(session.journal, file.sha256, None))
+    constraints = list(dict.fromkeys(point.constraint for point in points))
     assert result.truth_error is not None
     assert result.mismatch_after is not None
     return Run(
@@ -56,6 +61,7 @@ def run(path: Path, seed: int, overrides: list[str]) -> Run:
         result.truth_error.base_translation * 1e3,
         float(np.rad2deg(result.truth_error.base_rotation)),
         tuple(point.frames for point in points),
+        tuple(point.frames for point in points if constraints.index(point.constraint) >= 3),
         sum(not point.captured for point in points),
         result.verdict,
     )
@@ -81,11 +87,13 @@ def main() -> None:
                 flush=True,
             )
     frames = np.concatenate([one.frames for one in runs])
+    later = np.concatenate([one.later_frames for one in runs])
     mismatch, rotation, translation = np.array([(one.mismatch, one.rotation, one.translation) for one in runs]).T
     print(
         f"mismatch: mean {mismatch.mean():.4f}, max {mismatch.max():.4f} mm; T_P_A: rms {_rms(rotation):.4f}, max "
         f"{rotation.max():.4f} deg, rms {_rms(translation):.3f}, max {translation.max():.3f} mm; frames a point: mean "
-        f"{frames.mean():.2f}, p95 {np.percentile(frames, 95):.0f}, max {frames.max()}; "
+        f"{frames.mean():.2f}, p95 {np.percentile(frames, 95):.0f}, max {frames.max()}, "
+        f"from the fourth constraint on {later.mean():.2f}; "
         f"given up {sum(one.given_up for one in runs)} of {len(frames)} points"
     )
 

@@ -1,6 +1,7 @@
 """Detected corners against the truth, over random views through a lens with distortion.
 
 python -m tools.benchmarks.corners --views 200
+python -m tools.benchmarks.corners --views 500 --noise-grey 10 --blur-px 1.5
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from backends.simulator.rendering import Renderer
 from dualcal_hal.camera import Intrinsics
 from dualcal_hal.cellfile import load_cell
-from dualcal_hal.target import Checkerboard
+from dualcal_hal.target import Target
 from dualcal_hal.transforms import Array, rotation_from_vector, transform
 from procedures.detection import Detection, Detector
 
@@ -24,7 +25,7 @@ FACING = np.diag([1.0, -1.0, -1.0])
 """R_E_T of a board seen straight from the front, upright."""
 
 
-def project(board: Checkerboard, camera: Intrinsics, T_E_T: Array, points: Array | None = None) -> Array:
+def project(board: Target, camera: Intrinsics, T_E_T: Array, points: Array | None = None) -> Array:
     """(n, 2) px of the corners, or of ``points`` (n, 3) in T, by OpenCV."""
     rvec, _ = cv2.Rodrigues(T_E_T[:3, :3])
     points = board.corners if points is None else points
@@ -32,7 +33,7 @@ def project(board: Checkerboard, camera: Intrinsics, T_E_T: Array, points: Array
     return np.asarray(pixels, dtype=float).reshape(-1, 2)
 
 
-def random_view(rng: np.random.Generator, board: Checkerboard, camera: Intrinsics) -> Array:
+def random_view(rng: np.random.Generator, board: Target, camera: Intrinsics) -> Array:
     """T_E_T (4, 4) at 0.3 to 0.5 m, tilted by up to 45 deg, with the pattern and a rim in view."""
     rim = board.outline + 0.25 * board.square * np.sign(board.outline - board.outline.mean(axis=0))
     while True:
@@ -49,10 +50,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--noise-grey", type=float, help="grey levels; the cell's own where left out")
+    parser.add_argument("--blur-px", type=float, help="sigma in px; the cell's own where left out")
     options = parser.parse_args()
     file = load_cell(CELL)
     assert file.simulation is not None
-    noise, board = file.simulation.noise, file.cell.target.board
+    given = {"image_grey": options.noise_grey, "blur_px": options.blur_px}
+    update = {name: value for name, value in given.items() if value is not None}
+    noise, board = file.simulation.noise.model_copy(update=update), file.cell.target.board
     camera = Intrinsics(file.cell.camera.intrinsics.matrix, DISTORTION, file.cell.camera.intrinsics.size)
     renderer = Renderer(board, file.cell.target.margin, camera, noise.blur_px)
     detector = Detector(board, camera.size)

@@ -113,6 +113,10 @@ def measure_images(session: Path, model: CellModel, rounds: int) -> None:
 
     print(f"detection, tracked         {median_ms(tracked, 20 * rounds)}")
     print(f"detection, full search     {median_ms(full, 10 * rounds)}")
+    noise = 2.0 * np.random.default_rng(1).standard_normal(images[0].shape)
+    empty = np.clip(np.rint(128 + noise), 0, 255).astype(np.uint8)
+    expected = np.array(captures[0].corners)
+    print(f"detection, no target       {median_ms(lambda: detector.detect(empty, expected), 10 * rounds)}")
     first = captures[0]
     truth = json.loads((session / "result.json").read_text())["transforms"]
     T_P_E = (

@@ -41,7 +41,7 @@ def estimate_captures(options: EstimateOptions) -> None:
     if not options.captures.exists():
         raise UsageError(f"{options.captures}: does not exist")
     _check_out(options)
-    file = load_cell(_cell_path(options))
+    file = load_cell(_cell_path(options), meshes=False)
     captures, unfinished = _captures(options.captures, file)
     console = Console(stderr=options.json)
     ours = captures.cell_sha256 == file.sha256

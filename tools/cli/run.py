@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -16,6 +17,7 @@ from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.clock import utc_now
 from dualcal_hal.errors import UsageError
 from dualcal_hal.session.captures import Captures, write_captures
+from dualcal_hal.session.distances import read_distances
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.result import Result, with_truth_error, write_result
 from procedures.alignment import largest_alignment_error, tolerance_px
@@ -26,7 +28,7 @@ from procedures.observers import Observer, Observers
 from procedures.planning.model import CellModel
 from procedures.planning.plan import PLAN_FORMAT, Plan
 from procedures.rehearsal import rehearse
-from procedures.report import draw_summary
+from procedures.report import draw_plan, draw_summary
 from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.progress import progress
 from tools.cli.show import show_rehearsal, show_result
@@ -57,7 +59,7 @@ def run_cell(options: RunOptions) -> int:
     cell = Cell(file)
     _warn_of_alignment_error(console, file, model)
     if options.dry_run:
-        show_rehearsal(console, file.cell, rehearse(file.cell, model), as_json=options.json)
+        _rehearse(console, file, model, options)
         return 0
     _confirm(cell, options.yes)
     started = utc_now()
@@ -75,8 +77,24 @@ def run_cell(options: RunOptions) -> int:
         captures = _write_captures(file, session, started)
     result = conclude(file, session, captures)
     show_result(console, file.cell, result, simulated_truth(file), as_json=options.json)
+    if (distances := read_distances(session)) is not None:
+        console.print(f"least distance between the arms {distances.least()}", highlight=False)
     console.print(f"session: {session.folder}", soft_wrap=True, highlight=False)
     return 0 if result.verdict == "ok" else FAULT
+
+
+def _rehearse(console: Console, file: CellFile, model: CellModel, options: RunOptions) -> None:
+    """Show what a run would do; keep the plan and its picture where ``--out`` says."""
+    rehearsal = rehearse(file.cell, model)
+    show_rehearsal(console, file.cell, rehearsal, as_json=options.json)
+    if options.out is None:
+        console.print("With --out FOLDER the plan and a picture of it are written there.")
+        return
+    session = Session.create(options.out, file.text)
+    if rehearsal.plan is not None:
+        session.write_document("plan.json", rehearsal.plan.to_record())
+    draw_plan(session.folder / "plan.png", file.cell, rehearsal.arms, rehearsal.plan)
+    console.print(f"plan and picture: {session.folder}", soft_wrap=True, highlight=False)
 
 
 def _load(options: RunOptions) -> CellFile:
@@ -114,10 +132,30 @@ def execute(
         with Observers(watcher) as observers, cell as opened:
             engine = Engine(opened, session, observers)
             begun(engine)
-            engine.run(calibration.steps())
+            with _documents_kept(opened, session):
+                engine.run(calibration.steps())
     except Exception as error:
         error.add_note(f"what was captured is in {session.folder}")
         raise
+
+
+@contextmanager
+def _documents_kept(cell: Cell, session: Session) -> Iterator[None]:
+    """Write what the backends measured over the run, also over one that failed."""
+    try:
+        yield
+    except BaseException as error:
+        try:
+            _write_documents(cell, session)
+        except OSError as second:
+            error.add_note(f"what the backends measured could not be written ({second.strerror})")
+        raise
+    _write_documents(cell, session)
+
+
+def _write_documents(cell: Cell, session: Session) -> None:
+    for name, document in cell.documents().items():
+        session.write_document(name, document)
 
 
 def conclude(file: CellFile, session: Session, captures: Captures) -> Result:

@@ -35,7 +35,7 @@ def show_rehearsal(console: Console, cell: CellConfig, rehearsal: Rehearsal, *, 
         stand_off = rehearsal.stand_off
         console.print(
             f"\nFrom home to the stand-off: camera and target {stand_off.distance * 1e3:.0f} mm apart, "
-            f"the arms {stand_off.clearance * 1e3:.0f} mm clear of each other, by the nominal transforms"
+            f"the arms {stand_off.clearance * 1e3:.0f} mm clear of each other whatever the bases' error"
         )
         console.print(way_table(stand_off.way))
         for number, taken in enumerate(rehearsal.looks, start=1):

@@ -1,0 +1,191 @@
+"""The cell's bodies in PyBullet: both arms with camera and target, the floor and the fixtures."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from backends.simulator.bullet.client import pybullet
+from backends.simulator.bullet.solids import box
+from backends.simulator.bullet.urdf import Tool, arm_urdf, link_names
+from dualcal_hal.geometry import Block, Cylinder, HalfSpace, Mesh, Solid, camera_box, plate_box
+from dualcal_hal.transforms import Array, quaternion_from_rotation, transform
+
+if TYPE_CHECKING:
+    from backends.simulator.truth import Truth
+    from dualcal_hal.config import CellConfig
+
+Part = tuple[int, int]
+"""A body and a link of it, as PyBullet numbers them; -1 is its base."""
+
+STEP = 1 / 240
+"""Seconds of simulated time."""
+
+_FIRST_MOVING, _FIRST_ABOVE_FLOOR = 0, 1  # links that fixtures of an arm's own base, and floors, are in the way of
+
+_GRAVITY = -9.81  # m/s^2
+_POSITION_GAIN = 0.3
+# With PyBullet's own 50 iterations and 1e-7 some postures keep an error of 0.1 mrad, or never come to rest.
+_ITERATIONS, _RESIDUAL = 500, 1e-9
+_FORCE = 2000.0  # N m; the drives are never too weak
+
+
+class BulletBodies:
+    """Placed by the truth, in the passive base's frame; moved by the arms' motors alone, not by contact.
+
+    client: PyBullet's number of this world. arms: the body of each arm by its name; its links -1 to n - 1 are the
+    base and those of the chain, link n is what it carries. names: of all parts. standing: for each arm the bodies
+    that it must not touch, with the first of its links that this goes for.
+    """
+
+    def __init__(self, cell: CellConfig, truth: Truth) -> None:
+        self.client: int = pybullet.connect(pybullet.DIRECT)
+        self.names: dict[Part, str] = {}
+        self.arms: dict[str, int] = {}
+        self.standing: dict[str, list[Part]] = {name: [] for name in cell.robots}
+        self._motors: dict[str, dict[str, Any]] = {}
+        pybullet.setGravity(0, 0, _GRAVITY, physicsClientId=self.client)
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=STEP,
+            numSolverIterations=_ITERATIONS,
+            solverResidualThreshold=_RESIDUAL,
+            physicsClientId=self.client,
+        )
+        bases = {cell.active_name: truth.T_P_A, cell.passive_name: np.eye(4)}
+        self._add_arms(cell, truth, bases)
+        self._add_surroundings(cell, bases)
+
+    def _add_arms(self, cell: CellConfig, truth: Truth, bases: Mapping[str, Array]) -> None:
+        housing = box(*camera_box(cell.camera.body_radius, cell.camera.body_length))
+        plate = box(*plate_box(cell.target.plate_outline))
+        tools = {
+            cell.active_name: Tool("camera", truth.T_H_E, housing),
+            cell.passive_name: Tool("target", truth.T_F_T, plate),
+        }
+        for name, robot in sorted(cell.robots.items()):
+            chain = truth.chains[name]
+            self._load(name, arm_urdf(chain, robot.link_radius, tools[name]), bases[name])
+            for link, its_name in enumerate(link_names(chain.joints, tools[name]), start=-1):
+                self.names[self.arms[name], link] = f"{its_name} of {name}"
+            self.put(name, robot.home)
+
+    def _load(self, arm: str, urdf: str, T_P_base: Array) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "arm.urdf"
+            file.write_text(urdf)
+            body = self.arms[arm] = pybullet.loadURDF(
+                str(file),
+                *_pose(T_P_base),
+                useFixedBase=True,
+                flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+                physicsClientId=self.client,
+            )
+        links = pybullet.getNumJoints(body, physicsClientId=self.client)
+        for link in range(-1, links):
+            pybullet.changeDynamics(
+                body, link, linearDamping=0, angularDamping=0, jointDamping=0, physicsClientId=self.client
+            )
+            # Contact is looked for, and ends everything: nothing is left for the physics to push apart.
+            pybullet.setCollisionFilterGroupMask(body, link, 0, 0, physicsClientId=self.client)
+        joints = links - 1
+        self._motors[arm] = {
+            "bodyUniqueId": body,
+            "jointIndices": list(range(joints)),
+            "controlMode": pybullet.POSITION_CONTROL,
+            "forces": [_FORCE] * joints,
+            "positionGains": [_POSITION_GAIN] * joints,
+            "velocityGains": [1.0] * joints,
+            "physicsClientId": self.client,
+        }
+
+    def _add_surroundings(self, cell: CellConfig, bases: Mapping[str, Array]) -> None:
+        roles = {"active_base": cell.active_name, "passive_base": cell.passive_name}
+        for name, fixture in cell.fixtures.items():
+            owner = roles[fixture.base]
+            body = self._add_shape(fixture.solid, bases[owner] @ fixture.T, name)
+            for arm in self.arms:
+                self.standing[arm].append((body, _FIRST_MOVING if arm == owner else _FIRST_ABOVE_FLOOR))
+        if cell.floor is not None:
+            for arm, T_P_base in bases.items():
+                level = T_P_base @ transform(np.eye(3), [0.0, 0.0, cell.floor])
+                self.standing[arm].append((self._add_shape(HalfSpace(), level, "floor"), _FIRST_ABOVE_FLOOR))
+
+    def _add_shape(self, solid: Solid, T_P_solid: Array, name: str) -> int:
+        shape = pybullet.createCollisionShape(**_shape(solid), physicsClientId=self.client)
+        position, quaternion = _pose(T_P_solid)
+        body: int = pybullet.createMultiBody(
+            baseCollisionShapeIndex=shape,
+            basePosition=position,
+            baseOrientation=quaternion,
+            physicsClientId=self.client,
+        )
+        pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self.client)
+        self.names[body, -1] = name
+        return body
+
+    def put(self, arm: str, q: Array) -> None:
+        """Have an arm stand at joint angles (n,) in rad, and hold them."""
+        for joint, angle in enumerate(q.tolist()):
+            pybullet.resetJointState(self.arms[arm], joint, angle, physicsClientId=self.client)
+        self.drive(arm, q, np.zeros_like(q))
+
+    def drive(self, arm: str, q: Array, velocity: Array) -> None:
+        """Set the motors' set points: (n,) in rad and rad/s."""
+        pybullet.setJointMotorControlArray(
+            targetPositions=q.tolist(), targetVelocities=velocity.tolist(), **self._motors[arm]
+        )
+
+    def joints(self, arm: str) -> tuple[Array, Array]:
+        """An arm's joint angles (n,) in rad and velocities (n,) in rad/s."""
+        motors = self._motors[arm]
+        states = pybullet.getJointStates(motors["bodyUniqueId"], motors["jointIndices"], physicsClientId=self.client)
+        return np.array([state[0] for state in states]), np.array([state[1] for state in states])
+
+    def step(self) -> None:
+        """Let STEP seconds pass."""
+        pybullet.stepSimulation(physicsClientId=self.client)
+
+    def tool(self, arm: str) -> Part:
+        """What an arm carries: the camera, whose link's frame is E, or the target's plate, whose link's is T."""
+        return self.arms[arm], len(self._motors[arm]["jointIndices"])
+
+    def link_pose(self, body: int, link: int) -> Array:
+        """(4, 4): a link's frame in the passive base."""
+        # The first entries are of the centre of mass.
+        position, quaternion = pybullet.getLinkState(
+            body, link, computeForwardKinematics=True, physicsClientId=self.client
+        )[4:6]
+        R = np.reshape(pybullet.getMatrixFromQuaternion(quaternion), (3, 3))
+        return transform(R, position)
+
+    def close(self) -> None:
+        """Give the world up."""
+        pybullet.disconnect(physicsClientId=self.client)
+
+
+def _pose(T: Array) -> tuple[list[float], list[float]]:
+    """Position and quaternion (x, y, z, w)."""
+    return T[:3, 3].tolist(), quaternion_from_rotation(T[:3, :3]).tolist()
+
+
+def _shape(solid: Solid) -> dict[str, Any]:
+    """What PyBullet makes a collision shape from."""
+    match solid:
+        case Block(sizes):
+            return {"shapeType": pybullet.GEOM_BOX, "halfExtents": (sizes / 2).tolist()}
+        case Cylinder(radius, length):
+            return {"shapeType": pybullet.GEOM_CYLINDER, "radius": radius, "height": length}
+        case HalfSpace():
+            return {"shapeType": pybullet.GEOM_PLANE}
+        case Mesh(corners):
+            return {
+                "shapeType": pybullet.GEOM_MESH,
+                "vertices": corners.reshape(-1, 3).tolist(),
+                "indices": list(range(3 * len(corners))),
+                "flags": pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
+            }
+    raise TypeError(f"{solid!r} is no shape of a fixture")

@@ -1,0 +1,101 @@
+"""How near the bodies are to each other, and which of them are in contact."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from backends.simulator.bullet.bodies import BulletBodies, Part
+from backends.simulator.bullet.client import pybullet
+from dualcal_hal.geometry import ArmBody, CellGeometry
+from dualcal_hal.transforms import Array
+
+if TYPE_CHECKING:
+    from dualcal_hal.config import CellConfig
+
+BETWEEN, WITHIN = 10.0, 0.2
+"""Metres up to which distances between the arms, and of an arm to itself and its surroundings, are measured."""
+
+
+@dataclass(frozen=True)
+class Near:
+    """Two parts and the distance between them in m; below zero they are in contact."""
+
+    distance: float
+    first: str
+    second: str
+
+
+class Nearness:
+    """Measures no more often than the speed of the parts demands."""
+
+    def __init__(self, cell: CellConfig, bodies: BulletBodies) -> None:
+        self._bodies = bodies
+        shapes = CellGeometry.of(cell)
+        arms = {cell.active_name: shapes.active, cell.passive_name: shapes.passive}
+        self._own = {name: _own_pairs(body) for name, body in arms.items()}
+        self._reach = {name: _reach(body) for name, body in arms.items()}
+        # How far parts must go at least before any can touch, between the arms and within each.
+        self._room_between = 0.0
+        self._room_within = dict.fromkeys(arms, 0.0)
+
+    def contact(self, turned: Mapping[str, Array]) -> Near | None:
+        """The parts that touch, if any do, after each arm's joints have turned by so much (n,) in rad."""
+        ways = {arm: float(angles @ self._reach[arm]) for arm, angles in turned.items()}
+        self._room_between -= sum(ways.values())
+        found = []
+        if self._room_between <= 0:
+            found.append(self.between_arms())
+        for arm, way in ways.items():
+            self._room_within[arm] -= way
+            if self._room_within[arm] <= 0:
+                found.append(self._within_arm(arm))
+        return min((near for near in found if near.distance < 0), key=lambda near: near.distance, default=None)
+
+    def between_arms(self) -> Near:
+        """The least distance between the arms, camera and target included."""
+        first, second = (self._bodies.arms[arm] for arm in sorted(self._bodies.arms))
+        near = self._least(self._points(first, second, BETWEEN), BETWEEN)
+        self._room_between = near.distance
+        return near
+
+    def _within_arm(self, arm: str) -> Near:
+        """The least distance of an arm to itself and to what stands about it."""
+        body, own = self._bodies.arms[arm], self._own[arm]
+        points = [point for point in self._points(body, body, WITHIN) if (point[3], point[4]) in own]
+        for other, first_link in self._bodies.standing[arm]:
+            points += [point for point in self._points(body, other, WITHIN) if point[3] >= first_link]
+        near = self._least(points, WITHIN)
+        self._room_within[arm] = near.distance
+        return near
+
+    def _points(self, first: int, second: int, within: float) -> list[Any]:
+        return list(pybullet.getClosestPoints(first, second, within, physicsClientId=self._bodies.client))
+
+    def _least(self, points: Iterable[Any], within: float) -> Near:
+        nearest = min(points, key=lambda point: (point[8], point[3], point[4]), default=None)
+        if nearest is None:
+            return Near(within, "", "")
+        _, first, second, first_link, second_link = nearest[:5]
+        names = self._bodies.names
+        return Near(nearest[8], names[first, first_link], names[second, second_link])
+
+
+def _reach(body: ArmBody) -> Array:
+    """(n,) m: no part of the arm is farther from each joint's axis."""
+    lengths = np.array([np.hypot(row.a, row.d) for row in body.chain.rows])
+    tool = np.linalg.norm(body.tool.ends, axis=-1).max() + body.capsules.radius.max()
+    return np.asarray(np.cumsum(lengths[::-1])[::-1] + tool)
+
+
+def _own_pairs(body: ArmBody) -> frozenset[Part]:
+    """Pairs of an arm's links, as PyBullet numbers them, all of whose parts can meet and do not touch by their make."""
+    links = [*body.links.frame.tolist(), *[body.chain.joints + 1] * len(body.tool)]
+    apart = {(i, j) for i, j in body.pairs.tolist()}
+    pairs = list(itertools.combinations(range(len(links)), 2))
+    touching = {(links[i], links[j]) for i, j in pairs if (i, j) not in apart}
+    return frozenset((links[i] - 1, links[j] - 1) for i, j in pairs if (links[i], links[j]) not in touching)

@@ -1,0 +1,229 @@
+"""Finding a checkerboard: a lattice of the right size, in an order that the prediction decides."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from dualcal_hal.camera import Image
+from dualcal_hal.errors import UsageError
+from dualcal_hal.target import Checkerboard
+from dualcal_hal.transforms import Array, Mask
+from procedures.detection.appearance import contrast, gap
+from procedures.detection.corners import (
+    CONTRAST_LIMIT,
+    checked_blur,
+    homography,
+    inside,
+    lattice_points,
+    off_plane,
+    refined,
+    spacing,
+)
+from procedures.detection.exposure import around, raise_light_problem
+from procedures.detection.lattice import LEAST_STEP, OFF, find_lattices, find_saddles
+from procedures.detection.outcome import Detection, Miss, Refused, Region
+from procedures.detection.saddle import half_window, reach
+
+GAP_LIMIT = 0.4
+"""How far an edge may be from the middle grey, in parts of its contrast: spots with gaps are a half away."""
+GOES_ON_LIMIT = 0.75
+"""Contrast one square outside the corners, in parts of that inside: a half at the rim of a pattern."""
+ALIKE_LIMIT = 0.75
+"""An order is known if its misfit to the prediction is below this part of the second best's (38 deg of roll)."""
+PART_LIMIT = 0.5
+"""Where at least this part of the predicted corners is seen, the board is there, partly hidden."""
+
+_MORE_CORNERS = "the checkerboard in the image has more corners than the target"
+_FARTHEST_SHIFT = 2.5  # steps by which a prediction of a board that is partly hidden may be off
+_WIDE = 4.0  # least steps, from which on the image is made smaller for the search
+
+
+class CheckerboardFinder:
+    """Finds one board; all its corners or none, for a part does not say which part it is."""
+
+    def __init__(self, board: Checkerboard) -> None:
+        if min(board.rows, board.columns) < 3:
+            raise UsageError(
+                f"a checkerboard of {board.rows} x {board.columns} inner corners cannot be detected:"
+                " at least 3 x 3 are needed"
+            )
+        self._board = board
+        self._shape = (board.rows, board.columns)
+        self._lattice = lattice_points(range(board.columns), range(board.rows))
+        self._ring = np.concatenate(
+            [
+                lattice_points(range(board.columns), (-1, board.rows)),
+                lattice_points((-1, board.columns), range(board.rows)),
+            ]
+        )
+
+    def searches(self, size: tuple[int, int], near: Region | None, step: float) -> Iterator[tuple[Region, int]]:
+        """Regions to search, each with the scale for it, the quickest first; ``step``: between corners, in px."""
+        if near is not None:
+            yield near, 2 if step > _WIDE * LEAST_STEP else 1
+        yield (0, 0, *size), 2
+        yield (0, 0, *size), 1
+
+    def find(self, image: Image, region: Region, scale: int, predicted: Array | None) -> Detection:
+        """The board within the region; raises Refused if there is none, or none that is usable."""
+        x0, y0, x1, y1 = region
+        saddles = find_saddles(image[y0:y1, x0:x1], scale).moved((x0, y0))
+        refusal = Refused(Miss.NOT_FOUND, f"no pattern of {self._shape[0]} x {self._shape[1]} corners")
+        for window, ends in itertools.chain.from_iterable(
+            _windows(lattice, self._shape) for lattice in find_lattices(saddles, len(self._lattice))
+        ):
+            if not ends:
+                refusal = Refused(Miss.NOT_FOUND, _MORE_CORNERS)
+                continue
+            try:
+                return self._measure(image, window, predicted)
+            except Refused as refused:
+                refusal = refused
+        if refusal.missed.reason is Miss.NOT_FOUND and predicted is not None:
+            self._raise_if_in_part(image, saddles.points, predicted)
+        raise refusal
+
+    def _measure(self, image: Image, grid: Array, predicted: Array | None) -> Detection:
+        """Refine a candidate and see whether it is the board."""
+        orders = _orders_from_the_front(grid)
+        if not orders:
+            raise Refused(Miss.NOT_FOUND, "the candidate's corners do not lie like a board's")
+        grid, order_known = _choose(orders, predicted)
+        grid = self._refine(image, grid)
+        plane = homography(self._lattice, grid.reshape(-1, 2))
+        off = float(off_plane(plane, self._lattice, grid.reshape(-1, 2)).max())
+        if off > 0.0:
+            raise Refused(Miss.NOT_FOUND, f"a corner of the candidate is {off:.1f} px too far off the others' plane")
+        weakest = self._weakest_contrast(image, grid, plane)
+        blur = checked_blur(image, grid, 0.4 * spacing(grid))
+        return Detection(grid.reshape(-1, 2), order_known, blur, weakest, self._board.feature)
+
+    def _refine(self, image: Image, grid: Array) -> Array:
+        half = half_window(spacing(grid))
+        start, size = grid.reshape(-1, 2), (image.shape[1], image.shape[0])
+        if not np.all(inside(start, size, reach(half))):
+            raise Refused(
+                Miss.AT_BORDER,
+                f"a corner is within {reach(half)} px of the image's edge; bring the target nearer to the middle",
+            )
+        saddles = refined(image, start, half)
+        if not np.all(saddles.found):
+            raise Refused(Miss.NOT_FOUND, "a corner of the candidate is no saddle of the grey values")
+        return saddles.points.reshape(grid.shape)
+
+    def _weakest_contrast(self, image: Image, grid: Array, plane: Array) -> float:
+        """The contrast of the weakest corner, if black and white alternate over the pattern and no further."""
+        inner = contrast(image, plane, self._lattice)
+        inner *= np.sign(np.median(inner))
+        weakest = float(inner.min())
+        if weakest < CONTRAST_LIMIT:
+            raise Refused(
+                Miss.NOT_FOUND,
+                f"the squares of the candidate differ by {weakest:.0f} grey levels, {CONTRAST_LIMIT:g} at least;"
+                " give it more light, or more exposure",
+            )
+        if gap(image, grid) > GAP_LIMIT:
+            raise Refused(Miss.NOT_FOUND, "the candidate's dark and bright parts do not meet like squares")
+        outside = abs(float(np.median(contrast(image, plane, self._ring))))
+        if outside > GOES_ON_LIMIT * float(np.median(inner)):
+            raise Refused(Miss.NOT_FOUND, _MORE_CORNERS)
+        return weakest
+
+    def _raise_if_in_part(self, image: Image, saddles: Array, predicted: Array) -> None:
+        """Refused, with the reason for what is missing, if part of the board is seen near the prediction.
+
+        saddles: (m, 2) px.
+        """
+        step = spacing(predicted.reshape(*self._shape, 2))
+        places, size = _shifted(predicted, saddles, step), (image.shape[1], image.shape[0])
+        seen = _near(places, saddles, OFF * step)
+        if not PART_LIMIT * len(seen) <= seen.sum() < len(seen):
+            return
+        checked_blur(image, np.where(seen[:, None], places, np.nan).reshape(*self._shape, 2), 0.4 * step)
+        said = f"{seen.sum()} of {len(seen)} corners were found"
+        if not np.all(inside(places, size, reach(half_window(step)))):
+            raise Refused(Miss.AT_BORDER, f"{said}; bring the target nearer to the middle of the image")
+        raise_light_problem(around(image, places[~seen], 0.2 * step))
+        raise Refused(Miss.OCCLUDED, f"{said}; look what is in front of the rest")
+
+
+def _shifted(predicted: Array, points: Array, step: float) -> Array:
+    """``predicted`` (n, 2) px, shifted by at most a few steps to where most of the points (m, 2) agree with it."""
+    shifts = (points[:, None] - predicted).reshape(-1, 2)
+    shifts = shifts[np.linalg.norm(shifts, axis=1) <= _FARTHEST_SHIFT * step]
+    if len(shifts) == 0:
+        return predicted
+    agreeing = KDTree(shifts).query_ball_point(shifts, OFF * step, return_length=True)
+    return np.asarray(predicted + shifts[int(np.argmax(agreeing))])
+
+
+def _near(places: Array, points: Array, within: float) -> Mask:
+    """Which of the places (n, 2) have one of the points (m, 2) no farther than ``within`` px away."""
+    if len(points) == 0:
+        return np.zeros(len(places), dtype=bool)
+    distances, _ = KDTree(points).query(places)
+    return np.asarray(distances <= within)
+
+
+def _windows(grid: Array, shape: tuple[int, int]) -> list[tuple[Array, bool]]:
+    """The parts of a lattice (r, c, 2), NaN where nothing was seen, that are a whole ``shape`` (rows, columns), and
+    whether the lattice ends there."""
+    found = []
+    for turned, rows_first in ((grid, True), (np.swapaxes(grid, 0, 1), False)):
+        if not rows_first and shape[0] == shape[1]:
+            break
+        for i, j in np.ndindex(*(max(n - m + 1, 0) for n, m in zip(turned.shape[:2], shape, strict=True))):
+            window = turned[i : i + shape[0], j : j + shape[1]]
+            if np.all(np.isfinite(window)):
+                found.append((window, not _goes_on(turned, (i, j), shape)))
+    return found
+
+
+def _goes_on(grid: Array, at: tuple[int, int], shape: tuple[int, int]) -> bool:
+    """Whether most of a row or column beside the window of ``shape`` at a place of the lattice was seen too."""
+    (i, j), (rows, columns) = at, shape
+    there = np.pad(np.isfinite(grid[..., 0]), 1)
+    beside = (
+        there[i, j + 1 : j + 1 + columns],
+        there[i + rows + 1, j + 1 : j + 1 + columns],
+        there[i + 1 : i + 1 + rows, j],
+        there[i + 1 : i + 1 + rows, j + columns + 1],
+    )
+    return any(2 * int(line.sum()) > len(line) for line in beside)
+
+
+def _orders_from_the_front(grid: Array) -> list[Array]:
+    """All ways to number ``grid`` (rows, columns, 2) as a board seen from the front: two, four for a square one.
+
+    None if no numbering turns every square the same way round.
+    """
+    grids = [grid, np.swapaxes(grid, 0, 1)] if grid.shape[0] == grid.shape[1] else [grid]
+    flipped = [g[::down, ::right] for g in grids for down in (1, -1) for right in (1, -1)]
+    return [g for g in flipped if _is_from_the_front(g)]
+
+
+def _is_from_the_front(grid: Array) -> bool:
+    """Whether all squares keep their sense: rows to the right, columns down, in an image with y down."""
+    right, down = grid[:-1, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, :-1]
+    return bool(np.all(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0] > 0))
+
+
+def _choose(orders: list[Array], predicted: Array | None) -> tuple[Array, bool]:
+    """The order closest in shape to the prediction, and whether it clearly is; without one, the order that
+    reads most nearly like text in the image."""
+    if predicted is None:
+        return max(orders, key=lambda grid: float(np.mean(grid[:, -1, 0] - grid[:, 0, 0]))), False
+    expected = _shape_of(predicted)
+    misfits = np.array([np.linalg.norm(_shape_of(grid.reshape(-1, 2)) - expected) for grid in orders])
+    best, second = np.argsort(misfits)[:2]
+    return orders[best], bool(misfits[best] < ALIKE_LIMIT * misfits[second])
+
+
+def _shape_of(points: Array) -> Array:
+    """``points`` (n, 2) without their translation and scale."""
+    centred = points - points.mean(axis=0)
+    return np.asarray(centred / np.linalg.norm(centred))

@@ -1,0 +1,129 @@
+"""``plan.png``: both arms at the stand-off, the planned axes and positions, from the side and from above."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dualcal_hal.config import CellConfig
+from dualcal_hal.session.files import write_atomically
+from dualcal_hal.transforms import Array, apply
+from procedures.planning.model import Posture
+from procedures.planning.plan import Plan, PlannedConstraint
+from procedures.report.scene import arm_course, feature_point, field_of_view
+from procedures.report.style import BLUE, DARK, GREEN, GREY, ORANGE, TEXT, head, label
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SIZE_PX = (1600, 900)
+_DPI = 100
+_BEYOND = 1.08  # how far an axis is drawn, of the distance to its farthest position
+_USES = {"calibration": (BLUE, "o"), "verification": (GREEN, "s")}
+
+
+def draw_plan(path: Path, cell: CellConfig, arms: Posture, plan: Plan | None) -> None:
+    """Write the picture as a PNG of ``SIZE_PX``, all of it or nothing; everything is placed by the nominal transforms.
+
+    arms: where the arms are drawn; plan: None where there is none.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    png = io.BytesIO()
+    FigureCanvasAgg(plan_figure(cell, arms, plan)).print_png(png)  # type: ignore[no-untyped-call]
+    write_atomically(path, png.getvalue())
+
+
+def plan_figure(cell: CellConfig, arms: Posture, plan: Plan | None) -> Figure:
+    """The figure that :func:`draw_plan` writes, from the same parameters."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(SIZE_PX[0] / _DPI, SIZE_PX[1] / _DPI), dpi=_DPI, facecolor="white")
+    along, across = _level_directions(cell)
+    up = np.array([0.0, 0.0, 1.0])
+    panels = figure.subplots(
+        1, 2, gridspec_kw={"left": 0.06, "right": 0.985, "bottom": 0.08, "top": 0.76, "wspace": 0.16}
+    )
+    for axes, title, view, vertical in (
+        (panels[0], "From the side", np.array([along, up]), "height, mm"),
+        (panels[1], "From above", np.array([along, across]), "to the side, mm"),
+    ):
+        _draw_arms(axes, cell, arms, view)
+        for constraint in () if plan is None else plan.constraints:
+            _draw_constraint(axes, cell, constraint, view)
+        _finish(axes, f"from '{cell.passive_name}' towards '{cell.active_name}', mm", vertical)
+        head(axes, title)
+    _write_head(figure, cell, plan)
+    return figure
+
+
+def _level_directions(cell: CellConfig) -> tuple[Array, Array]:
+    """Level directions (3,) in P: towards the active base, and to the left of that."""
+    toward = cell.nominal.T_P_A[:3, 3] * [1.0, 1.0, 0.0]
+    along = toward / np.linalg.norm(toward) if np.any(np.abs(toward) > 1e-6) else np.array([1.0, 0.0, 0.0])
+    return along, np.cross([0.0, 0.0, 1.0], along)
+
+
+def _draw_arms(axes: Axes, cell: CellConfig, arms: Posture, view: Array) -> None:
+    T_P_A = cell.nominal.T_P_A
+    T_P_E = T_P_A @ cell.active.chain.forward(arms.active) @ cell.nominal.T_H_E
+    T_P_T = cell.passive.chain.forward(arms.passive) @ cell.passive.target_mount_transform
+    active = apply(T_P_A, arm_course(cell.active.chain, arms.active))
+    passive = arm_course(cell.passive.chain, arms.passive)
+    camera = np.vstack([active[-1], apply(T_P_E, field_of_view(cell))])
+    target = np.vstack([passive[-1], apply(T_P_T, cell.target.board.outline[[0, 1, 2, 3, 0]])])
+    for words, course, tool, colour in (
+        (f"'{cell.active_name}' with the camera", active, camera, ORANGE),
+        (f"'{cell.passive_name}' with the target", passive, target, DARK),
+    ):
+        _line(axes, course, view, color=colour, linewidth=6, alpha=0.85, solid_joinstyle="round", label=words)
+        _line(axes, tool, view, color=colour, linewidth=2)
+
+
+def _draw_constraint(axes: Axes, cell: CellConfig, constraint: PlannedConstraint, view: Array) -> None:
+    colour, marker = _USES[constraint.use]
+    T_P_E = cell.nominal.T_P_A @ cell.active.chain.forward(constraint.active) @ cell.nominal.T_H_E
+    camera, axis = T_P_E[:3, 3], T_P_E[:3, 2]
+    farthest = _BEYOND * max(position.distance for position in constraint.positions)
+    points = np.array([feature_point(cell, position.passive) for position in constraint.positions])
+    first = constraint.name.endswith("/00")
+    words = f"{constraint.use}: axis from the camera, positions" if first else None
+    _line(axes, np.array([camera, camera + farthest * axis]), view, color=colour, linewidth=1.3)
+    _line(axes, points, view, color=colour, linestyle="none", marker=marker, markersize=5, label=words)
+    _line(axes, camera[None], view, color=colour, linestyle="none", marker="x", markersize=8, markeredgewidth=2)
+    number = constraint.name.rpartition("/")[2].lstrip("0") or "0"
+    x, y = 1e3 * view @ (camera - 0.03 * axis)
+    axes.text(x, y, number, fontsize=TEXT - 1, color=colour, weight="bold", ha="center", va="center")
+
+
+def _line(axes: Axes, points: Array, view: Array, **style: object) -> None:
+    axes.plot(*(1e3 * view @ points.T), **style)  # type: ignore[arg-type]
+
+
+def _finish(axes: Axes, horizontal: str, vertical: str) -> None:
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    axes.grid(True, color=GREY, alpha=0.25, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    label(axes, horizontal, vertical)
+
+
+def _write_head(figure: Figure, cell: CellConfig, plan: Plan | None) -> None:
+    title = f"{cell.name}  |  " + ("stand-off, no provisional plan" if plan is None else _title(plan))
+    figure.text(0.02, 0.955, title, fontsize=18, weight="bold", color=DARK, va="center", parse_math=False)
+
+
+def _title(plan: Plan) -> str:
+    parts: Sequence[str] = [
+        "provisional plan" if plan.provisional else "plan",
+        f"{len(plan.constraints)} constraints",
+        f"about {plan.seconds:.0f} s",
+    ]
+    spread = [] if plan.axis_spread is None else [f"axes spread {plan.axis_spread:.3f}"]
+    return ", ".join([*parts, *spread])

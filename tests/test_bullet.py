@@ -1,0 +1,414 @@
+"""PyBullet: arms with weight that arrive where they are sent, and contact that ends everything."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from backends.simulator import SimulatorBackend
+from backends.simulator.bullet.bodies import BulletBodies
+from backends.simulator.bullet.client import pybullet
+from backends.simulator.bullet.nearness import Nearness
+from backends.simulator.bullet.stepper import SETTLED
+from backends.simulator.trajectory import Trajectory
+from backends.simulator.truth import Truth
+from dualcal_hal.cellfile import CellFile, load_cell
+from dualcal_hal.errors import CellFileError, CommandRefused, Contact, MotionFailed
+from dualcal_hal.geometry import CellGeometry, Placement, segment_distance
+from dualcal_hal.kinematics import Chain, Row
+from dualcal_hal.robot import JointPath, Joints, Mode, Motion, RobotState
+from dualcal_hal.session.distances import Distances
+from dualcal_hal.transforms import Array, apply
+from tests.cells import NOISELESS, PAPER, SMALL
+from tools.cli.app import app
+
+ACTIVE, PASSIVE = "left", "right"
+BULLET = "simulation.stepper=bullet"
+NO_NOISE = tuple(override for override in NOISELESS if override.startswith("simulation"))
+TIMEOUT = 30.0
+NEVER = threading.Event()
+
+
+@cache
+def cell(*overrides: str) -> CellFile:
+    return load_cell(PAPER, (BULLET, *NO_NOISE, *overrides))
+
+
+def opened(file: CellFile) -> Iterator[SimulatorBackend]:
+    backend = SimulatorBackend("sim", file)
+    backend.open(TIMEOUT)
+    yield backend
+    backend.close()
+
+
+@pytest.fixture
+def backend() -> Iterator[SimulatorBackend]:
+    yield from opened(cell())
+
+
+def degrees(*angles: float) -> Joints:
+    return tuple(np.radians(angles).tolist())
+
+
+def start(backend: SimulatorBackend, name: str, *waypoints: Joints) -> Motion:
+    config = backend.cell.cell.robots[name]
+    return backend.robot(name).start(JointPath(waypoints, tuple(config.speed), tuple(config.acceleration)))
+
+
+def move(backend: SimulatorBackend, name: str, target: Joints) -> RobotState:
+    return start(backend, name, target).wait(TIMEOUT)
+
+
+def truth_of(file: CellFile) -> Truth:
+    assert file.simulation is not None
+    return Truth(file.cell, file.simulation)
+
+
+@pytest.fixture
+def bodies() -> Iterator[BulletBodies]:
+    file = cell()
+    bodies = BulletBodies(file.cell, truth_of(file))
+    yield bodies
+    bodies.close()
+
+
+# Bodies
+
+
+@pytest.mark.parametrize("arm", [ACTIVE, PASSIVE])
+def test_what_the_arms_carry_stands_where_the_true_chain_has_it(bodies: BulletBodies, arm: str) -> None:
+    truth, rng = truth_of(cell()), np.random.default_rng(1)
+    T_P_base, T_flange_tool = (truth.T_P_A, truth.T_H_E) if arm == ACTIVE else (np.eye(4), truth.T_F_T)
+    for q in rng.uniform(-3, 3, (50, 6)):
+        bodies.put(arm, q)
+        expected = T_P_base @ truth.chains[arm].forward(q) @ T_flange_tool
+        np.testing.assert_allclose(bodies.link_pose(*bodies.tool(arm)), expected, rtol=0, atol=1e-6)
+
+
+ANGLE, LENGTH = st.floats(-np.pi, np.pi), st.floats(-0.6, 0.6)
+PLAIN = st.builds(Row, theta=ANGLE, d=LENGTH, a=LENGTH, alpha=ANGLE)
+HAYATI = st.builds(Row, theta=ANGLE, d=st.just(0.0), a=LENGTH, alpha=ANGLE, beta=ANGLE)
+
+
+@settings(max_examples=20, deadline=None)
+@given(rows=st.lists(PLAIN | HAYATI, min_size=6, max_size=6), q=st.lists(ANGLE, min_size=6, max_size=6))
+def test_that_holds_for_any_denavit_hartenberg_table(rows: list[Row], q: list[float]) -> None:
+    file = cell()
+    truth = truth_of(file)
+    truth.chains[PASSIVE] = Chain(tuple(rows))
+    bodies = BulletBodies(file.cell, truth)
+    bodies.put(PASSIVE, np.array(q))
+    expected = truth.chains[PASSIVE].forward(q) @ truth.T_F_T
+    np.testing.assert_allclose(bodies.link_pose(*bodies.tool(PASSIVE)), expected, rtol=0, atol=1e-6)
+    bodies.close()
+
+
+def surface_of_tool(bodies: BulletBodies, arm: str) -> Array:
+    """Points (k, 3) on the box that an arm carries in PyBullet, in the passive base."""
+    ((_, _, shape, size, _, position, quaternion),) = pybullet.getCollisionShapeData(
+        *bodies.tool(arm), physicsClientId=bodies.client
+    )
+    assert shape == pybullet.GEOM_BOX
+    grid = np.array(list(itertools.product(np.linspace(-0.5, 0.5, 13), repeat=3)))
+    surface = grid[np.abs(grid).max(axis=1) == 0.5] * size
+    # PyBullet places a shape from the link's centre of mass.
+    state = pybullet.getLinkState(*bodies.tool(arm), computeForwardKinematics=True, physicsClientId=bodies.client)
+    pose = pybullet.multiplyTransforms(*state[:2], position, quaternion)
+    R = np.reshape(pybullet.getMatrixFromQuaternion(pose[1]), (3, 3))
+    return np.asarray(surface @ R.T + pose[0])
+
+
+def sticks_out(points: Array, ends: Array, radii: Array) -> float:
+    """How far (m) the farthest of points (k, 3) is from what capsules (c, 2, 3) fill."""
+    outside = segment_distance(np.stack([points, points], axis=1)[:, None], ends[None]) - radii
+    return float(outside.min(axis=1).max())
+
+
+@pytest.mark.parametrize("arm", [ACTIVE, PASSIVE])
+def test_the_planners_capsules_hold_the_boxes_that_stand_for_camera_and_target_here(arm: str) -> None:
+    file = cell()
+    truth, geometry = truth_of(file), CellGeometry.of(file.cell)
+    truth.T_P_A, truth.T_H_E = np.eye(4), file.cell.nominal.T_H_E
+    bodies = BulletBodies(file.cell, truth)
+    body, q = (geometry.active if arm == ACTIVE else geometry.passive), file.cell.robots[arm].home
+    tool = slice(len(body.links), None)
+    points = surface_of_tool(bodies, arm)
+    assert sticks_out(points, body.segments([q])[0, tool], body.capsules.radius[tool]) < 1e-6
+    # The test can tell: a box a little larger would stick out.
+    larger = points.mean(axis=0) + 1.02 * (points - points.mean(axis=0))
+    assert sticks_out(larger, body.segments([q])[0, tool], body.capsules.radius[tool]) > 0
+    bodies.close()
+
+
+def test_the_true_camera_sticks_out_of_the_planners_capsule_by_less_than_the_clearance(bodies: BulletBodies) -> None:
+    file = cell()
+    truth, body = truth_of(file), CellGeometry.of(file.cell).active
+    ends = apply(truth.T_P_A, body.segments([file.cell.active.home])[0, -1])
+    out = sticks_out(surface_of_tool(bodies, ACTIVE), ends[None], body.capsules.radius[-1:])
+    assert 0 < out < file.cell.procedure.clearance
+
+
+def test_parts_are_as_far_apart_as_the_planners_shapes_are_or_farther(bodies: BulletBodies) -> None:
+    file = cell()
+    geometry, placement = CellGeometry.of(file.cell), Placement(truth_of(file).T_P_A, 0.012, 0.0)
+    nearness, rng = Nearness(file.cell, bodies), np.random.default_rng(2)
+    for q_a, q_p in rng.uniform(-1.5, 1.5, (100, 2, 6)):
+        bodies.put(ACTIVE, q_a)
+        bodies.put(PASSIVE, q_p)
+        assert nearness.between_arms().distance >= geometry.between(q_a, q_p, placement)[0]
+
+
+# Motion
+
+
+def test_an_arm_arrives_where_it_was_sent_against_its_weight_and_stays(backend: SimulatorBackend) -> None:
+    for target in (degrees(30, -20, 80, 40, 60, 100), degrees(30, -20, 80, 40, 60, 101)):
+        arrived = np.array(move(backend, ACTIVE, target).positions)
+        off = np.abs(arrived - target).max()
+        assert 0 < off <= SETTLED
+        # While the other arm moves time passes for this one too.
+        move(backend, PASSIVE, (*target[:5], -target[5]))
+        np.testing.assert_allclose(backend.robot(ACTIVE).read(TIMEOUT).positions, arrived, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("offset", [0.5, 0.002])
+def test_a_motion_ends_when_the_joints_have_settled_not_when_their_set_points_rest(
+    backend: SimulatorBackend, offset: float
+) -> None:
+    config = backend.cell.cell.active
+    target = tuple((config.home + offset).tolist())
+    trajectory = Trajectory(config.home, config.acceleration)
+    trajectory.follow(JointPath((target,), tuple(config.speed), tuple(config.acceleration)), 0.0)
+    move(backend, ACTIVE, target)
+    assert 0.01 < backend.clock.now() - trajectory.end < 0.1
+
+
+def test_a_motion_that_does_not_settle_fails(backend: SimulatorBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("backends.simulator.bullet.stepper.SETTLED", 0.0)
+    with pytest.raises(MotionFailed, match="not settled 3 s after"):
+        move(backend, ACTIVE, degrees(0, 10, 60, 0, 30, 0))
+    monkeypatch.undo()
+    move(backend, ACTIVE, degrees(0, 0, 60, 0, 30, 0))
+
+
+def test_on_the_way_joints_are_near_their_set_points(backend: SimulatorBackend) -> None:
+    exact = next(runs := opened(cell("simulation.stepper=kinematic")))
+    states: dict[str, list[RobotState]] = {}
+    for name, one in (("bullet", backend), ("kinematic", exact)):
+        heard = states.setdefault(name, [])
+        one.robot(ACTIVE).subscribe(heard.append)
+        move(one, ACTIVE, degrees(60, -30, 20, 10, 50, -60))
+    for here, there in zip(states["bullet"], states["kinematic"], strict=False):
+        assert here.time == there.time
+        np.testing.assert_allclose(here.positions, there.positions, rtol=0, atol=0.02)
+    assert max(max(state.velocities) for state in states["bullet"]) > 1.0
+    runs.close()
+
+
+def test_both_arms_may_move_at_once(backend: SimulatorBackend) -> None:
+    motions = [start(backend, name, degrees(20, 0, 60, 0, 30, 0)) for name in (ACTIVE, PASSIVE)]
+    for motion in motions:
+        np.testing.assert_allclose(motion.wait(TIMEOUT).positions, degrees(20, 0, 60, 0, 30, 0), rtol=0, atol=SETTLED)
+
+
+def test_the_same_motions_are_the_same_bit_for_bit() -> None:
+    def run() -> list[Joints]:
+        backend = next(runs := opened(cell()))
+        readings = [move(backend, ACTIVE, degrees(20, 0, 60, 0, 30, 0)).positions]
+        start(backend, PASSIVE, degrees(20, 0, 60, 0, 30, 0))
+        backend.robot(PASSIVE).stop("test")
+        readings += [backend.robot(name).read(TIMEOUT).positions for name in (ACTIVE, PASSIVE)]
+        runs.close()
+        return readings
+
+    assert run() == run()
+
+
+# Contact
+
+LEANING = degrees(0, -45, 45, 0, 0, 0)
+
+
+def test_arms_that_meet_halt_and_both_motions_fail_naming_the_parts(backend: SimulatorBackend) -> None:
+    robots = [backend.robot(name) for name in (ACTIVE, PASSIVE)]
+    motions = [start(backend, robot.name, LEANING) for robot in robots]
+    for motion in motions:
+        with pytest.raises(Contact, match=r"(camera|link 6) of left touches (target|link 6) of right"):
+            motion.wait(TIMEOUT)
+    for robot in robots:
+        halted = robot.read(TIMEOUT)
+        assert (halted.mode, halted.velocities) == (Mode.FAULT, (0.0,) * 6)
+        assert "touches" in halted.faults[0]
+        assert np.abs(np.subtract(halted.positions, LEANING)).max() > 0.1
+        assert robot.stop("test").confirmed
+        for command in (lambda one=robot: one.enable(TIMEOUT), lambda one=robot: start(backend, one.name, LEANING)):
+            with pytest.raises(CommandRefused, match="touches"):
+                command()
+        backend.clock.wait(NEVER, backend.clock.now() + 1.0)
+        assert robot.read(TIMEOUT).positions == halted.positions
+
+
+def test_contact_is_found_before_parts_are_deep_in_each_other(backend: SimulatorBackend) -> None:
+    move(backend, PASSIVE, degrees(0, -30, 30, 0, 0, 0))
+    with pytest.raises(Contact):
+        move(backend, ACTIVE, LEANING)
+    distances = Distances.from_document(backend.documents()["distances.json"])
+    assert distances.distances[-1] < 0.1
+    assert min(distances.distances) > -0.02
+
+
+@pytest.mark.parametrize(
+    ("target", "parts"),
+    [
+        (degrees(0, -70, 30, 0, 30, 0), "(link [56]|camera) of left touches floor"),
+        (degrees(0, 0, -80, 0, 0, 0), "link [12] of left touches link [56] of left"),
+    ],
+)
+def test_an_arm_that_meets_the_floor_or_itself_halts(backend: SimulatorBackend, target: Joints, parts: str) -> None:
+    with pytest.raises(Contact, match=parts):
+        move(backend, ACTIVE, target)
+
+
+POST = "at: {translation_mm: [450, 450, 450], rotation_vector_deg: [0, 0, 30]}"
+
+
+@pytest.mark.parametrize("shape", ["box_mm: [200, 200, 900]", "cylinder_mm: {radius: 100, length: 900}", "mesh"])
+def test_an_arm_that_meets_a_fixture_halts(shape: str, tmp_path: Path) -> None:
+    if shape == "mesh":
+        shape = f"mesh: {{file: {tmp_path / 'post.obj'}}}"
+        corners = itertools.product((-100, 100), (-100, 100), (-450, 450))
+        faces = ["1 2 4 3", "5 6 8 7", "1 2 6 5", "3 4 8 7", "1 3 7 5", "2 4 8 6"]
+        lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {face}" for face in faces]
+        (tmp_path / "post.obj").write_text("\n".join(lines) + "\n")
+    backend = next(runs := opened(cell(f"fixtures={{post: {{in: passive_base, {POST}, {shape}}}}}")))
+    move(backend, PASSIVE, LEANING)
+    with pytest.raises(Contact, match="of right touches post"):
+        move(backend, PASSIVE, (np.radians(90), *LEANING[1:]))
+    runs.close()
+
+
+def test_a_cell_whose_arms_touch_at_home_does_not_open() -> None:
+    home = "[0, -45, 45, 0, 0, 0]"
+    backend = SimulatorBackend("sim", cell(f"robots.left.home_deg={home}", f"robots.right.home_deg={home}"))
+    with pytest.raises(Contact, match=r"left touches .* of right"):
+        backend.open(TIMEOUT)
+    backend.close()
+
+
+# Distances
+
+
+def test_the_distance_between_the_arms_is_recorded_30_times_a_second_while_one_moves(backend: SimulatorBackend) -> None:
+    move(backend, ACTIVE, degrees(0, -20, 60, 0, 30, 0))
+    backend.clock.wait(NEVER, backend.clock.now() + 5.0)
+    moved = backend.clock.now() - 5.0
+    distances = Distances.from_document(json.loads(json.dumps(backend.documents()["distances.json"])))
+    np.testing.assert_allclose(np.diff(distances.times), 1 / 30)
+    assert distances.times[-1] == pytest.approx(moved, abs=1 / 30)
+    assert 0.2 < distances.distances[-1] < distances.distances[0] - 0.1
+    assert all(first.endswith("of left") and second.endswith("of right") for first, second in distances.between)
+
+
+def test_the_least_distance_is_told_with_its_parts_and_its_time() -> None:
+    pairs = [("camera of left", "link 5 of right"), ("link 6 of left", "target of right"), ("a", "b")]
+    distances = Distances([1.0, 12.34, 20.0], [0.2, 0.0612, 0.1], pairs)
+    assert distances.least() == "61 mm: link 6 of left to target of right, at 12.3 s"
+
+
+# Runs
+
+
+def dualcal(*arguments: object):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def sets(*overrides: str) -> list[str]:
+    return [part for override in overrides for part in ("--set", override)]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bullet") / "session"
+    result = dualcal("run", PAPER, "--out", folder, "--seed", 3, *sets(*SMALL, BULLET))
+    assert result.exit_code == 0, result.output
+    (folder / "output.txt").write_text(result.output)
+    return folder
+
+
+def test_a_run_keeps_the_distances_and_prints_the_least(session: Path) -> None:
+    distances = Distances.from_document(json.loads((session / "distances.json").read_text()))
+    assert min(distances.distances) > 0.02
+    output = " ".join((session / "output.txt").read_text().split())
+    assert f"least distance between the arms {distances.least()}" in output
+
+
+def test_a_run_can_be_repeated_to_the_last_bit(session: Path, tmp_path: Path) -> None:
+    assert dualcal("run", PAPER, "--out", tmp_path / "again", "--seed", 3, *sets(*SMALL, BULLET)).exit_code == 0
+    first, second = (
+        json.loads((folder / "captures.json").read_text())["captures"] for folder in (session, tmp_path / "again")
+    )
+    assert first == second
+
+
+def test_a_run_whose_arms_meet_ends_with_exit_code_1_and_names_the_parts(tmp_path: Path) -> None:
+    # The bases stand closer than the plan and its guard are told.
+    closer = "simulation.truth.active_base_in_passive_base.translation_mm=[800, 0, 0]"
+    options = sets(*SMALL, BULLET, closer, "procedure.first_looks=0")
+    result = dualcal("run", PAPER, "--out", tmp_path / "session", *options)
+    assert result.exit_code == 1
+    assert " of left touches " in result.output
+    distances = Distances.from_document(json.loads((tmp_path / "session" / "distances.json").read_text()))
+    assert min(distances.distances) < 0.1
+
+
+# PyBullet's absence and its greeting
+
+
+@pytest.fixture
+def _no_pybullet(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith("backends.simulator.bullet")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+
+
+@pytest.mark.usefixtures("_no_pybullet")
+def test_without_pybullet_a_run_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    result = dualcal("run", PAPER, "--out", tmp_path / "session", "--set", BULLET)
+    assert result.exit_code == 2
+    output = " ".join(result.output.split())
+    assert "pip install 'dualcal[bullet]'" in output
+    assert "--set simulation.stepper=kinematic" in output
+    assert not (tmp_path / "session").exists()
+
+
+@pytest.mark.usefixtures("_no_pybullet")
+def test_without_pybullet_a_cell_is_simulated_without_physics() -> None:
+    with pytest.raises(CellFileError):
+        SimulatorBackend("sim", cell())
+    backend = next(runs := opened(cell("simulation.stepper=kinematic")))
+    move(backend, ACTIVE, degrees(20, 0, 60, 0, 30, 0))
+    assert backend.documents() == {}
+    runs.close()
+
+
+def test_pybullet_is_imported_for_a_world_alone_and_without_a_word() -> None:
+    program = (
+        "import sys; from dualcal_hal.cellfile import load_cell; from pathlib import Path; import tools.cli.run;"
+        "from backends.simulator import SimulatorBackend; from tools.cli.app import app;"
+        f"cell = load_cell(Path({str(PAPER)!r}), [{BULLET!r}]); assert 'pybullet' not in sys.modules;"
+        "SimulatorBackend('sim', cell); assert 'pybullet' in sys.modules"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")

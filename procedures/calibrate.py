@@ -22,7 +22,15 @@ from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Rejected
 from dualcal_hal.transforms import Array
 from procedures.alignment import Aligner, Alignment, AxisTrack, Outcome, point_on_axis, target_on_axis, tolerance_px
 from procedures.detection import Detector
-from procedures.events import BeliefRefined, ConstraintDone, ConstraintGivenUp, LookTaken, PlanReady, PointDone
+from procedures.events import (
+    BeliefRefined,
+    ConstraintDone,
+    ConstraintGivenUp,
+    LookTaken,
+    NotHome,
+    PlanReady,
+    PointDone,
+)
 from procedures.planning.belief import Belief
 from procedures.planning.candidates import ROOM
 from procedures.planning.first_look import find_stand_off, look_postures
@@ -330,7 +338,8 @@ class Calibration:
 
     def _go_home(self) -> Procedure[None]:
         if not (yield from self._go(self._model.home)):
-            raise NoPlan("no clear way home from where the arms stand; jog them apart")
+            # All is captured: where the arms rest takes nothing from the result.
+            yield from tell(NotHome(self._ways.blocked_by((yield from self._here()), self._model.home)))
 
 
 def requests_of(procedure: ProcedureConfig) -> list[Request]:

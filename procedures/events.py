@@ -92,3 +92,13 @@ class BeliefRefined:
 
     def __str__(self) -> str:
         return f"transforms for planning from {counted(self.views, 'view')}, {self.rms_px:.3f} px rms"
+
+
+@dataclass(frozen=True)
+class NotHome:
+    """All is captured, but no clear way home was found."""
+
+    reason: str
+
+    def __str__(self) -> str:
+        return f"no clear way home ({self.reason}): the arms stay where they are; jog them apart, then home"

@@ -111,12 +111,22 @@ def test_bases_too_close_for_the_error_allowed_have_no_stand_off_and_are_told_to
         found_from(Posture(HOME, HOME), "nominal.active_base_in_passive_base.translation_mm=[600, 0, 0]")
 
 
-def test_where_an_arm_stands_in_the_way_it_is_named_with_where_to_jog_it():
-    """The arms reach into each other's space, so that the largest error lets them touch on any way out."""
-    start = Posture(HOME, REACHING)
+@pytest.mark.parametrize(
+    ("free", "advice"),
+    [
+        ("passive", r"jog 'right' away from 'left', towards its home \[0, 0, 60, 0, 30, 0\] deg"),
+        ("active", r"jog 'left' away from 'right', towards its home \[0, 0, 60, 0, 30, 0\] deg"),
+        (None, r"jog both arms apart, towards their homes \[0, 0, 60, 0, 30, 0\] and \[0, 0, 60, 0, 30, 0\] deg"),
+    ],
+)
+def test_without_a_way_to_the_stand_off_the_arm_that_would_free_it_is_named(free, advice, monkeypatch):
+    """As if there were a way only where that arm is home; what touches on straight moves is told, too."""
+    monkeypatch.setattr(
+        WayFinder, "find", lambda self, start, goal: () if free and getattr(start, free) == HOME else None
+    )
     close = "nominal.active_base_in_passive_base.translation_mm=[900, 0, 0]"
-    with pytest.raises(NoPlan, match=r"jog 'right' away from 'left', towards its home \[0, 0, 60, 0, 30, 0\] deg"):
-        found_from(start, close)
+    with pytest.raises(NoPlan, match=rf"'left' may touch link 3 of 'right'.*: {advice}"):
+        found_from(Posture(REACHING, REACHING), close)
 
 
 # -- looks -----------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from procedures.calibrate import Calibration, captures_of
 from procedures.engine import Engine
 from procedures.observers import Observers
 from procedures.planning.model import CellModel
+from procedures.planning.ways import WayFinder
 from tests.cells import NOISELESS, PAPER, SMALL
 from tools.cli.app import app
 from tools.cli.run import execute
@@ -194,6 +195,21 @@ def test_on_a_good_end_both_arms_are_home_again_and_the_devices_closed(tmp_path)
     for arm in (cell.active, cell.passive):
         with pytest.raises(NotOpen):
             arm.robot.read(1.0)
+
+
+def test_without_a_way_home_the_arms_stay_where_they_are_and_the_result_counts(tmp_path, monkeypatch):
+    find = WayFinder.find
+
+    def none_home(self, start, goal):
+        home = (0.0, 0.0, np.deg2rad(60.0), 0.0, np.deg2rad(30.0), 0.0)
+        return None if goal.active == goal.passive == home else find(self, start, goal)
+
+    monkeypatch.setattr(WayFinder, "find", none_home)
+    result = dualcal("run", PAPER, "--out", tmp_path / "s", *sets(*SMALL))
+    assert result.exit_code == 0
+    assert "no clear way home" in result.stdout
+    assert "jog them apart" in result.stdout
+    assert "Verdict: ok" in result.stdout
 
 
 def test_captures_of_a_constraint_that_was_given_up_are_left_out(session, tmp_path):

@@ -47,18 +47,17 @@ def finder(model, uncertainty=(0.0, 0.0), apart=0.0):
     return WayFinder(model, replace(model.nominal, placement=Placement(T_P_A, *uncertainty)), [model.home])
 
 
-def shared_postures(model, uncertainty, count, seed):
-    """Random postures that keep clear, with camera and target less than 0.6 m apart."""
+def shared_postures(model, uncertainty, seed):
+    """Random postures without end that keep clear, with camera and target less than 0.6 m apart."""
     placement, margin = Placement(model.nominal.T_P_A, *uncertainty), finder(model).margin
-    rng, found = np.random.default_rng(seed), []
-    while len(found) < count:
+    rng = np.random.default_rng(seed)
+    while True:
         q_a = random_joints(rng, 400, model.active.lower, model.active.upper)
         q_p = random_joints(rng, 400, model.passive.lower, model.passive.upper)
         camera, target = model.camera_in_passive(q_a, model.nominal), model.target_in_passive(q_p)
         good = np.linalg.norm(camera[:, :3, 3] - target[:, :3, 3], axis=1) < 0.6
         good[good] = model.geometry.clearance(q_a[good], q_p[good], placement) >= margin
-        found += [Posture.of(a, p) for a, p in zip(q_a[good], q_p[good], strict=True)]
-    return found[:count]
+        yield from (Posture.of(a, p) for a, p in zip(q_a[good], q_p[good], strict=True))
 
 
 def is_straight(way):
@@ -66,15 +65,11 @@ def is_straight(way):
 
 
 def blocked_queries(model, uncertainty, count, seed):
-    """Start, goal and the way between them, where an arm cannot go straight first, nor the other."""
+    """The finder, and starts and goals between which the arms cannot go straight, whichever goes first."""
     ways = finder(model, uncertainty)
-    found = []
-    for start, goal in itertools.pairwise(shared_postures(model, uncertainty, 30 * count, seed)):
-        if ways.blocked_by(start, goal).count(";") == 1:
-            found.append((start, goal))
-        if len(found) == count:
-            break
-    return ways, found
+    pairs = itertools.pairwise(shared_postures(model, uncertainty, seed))
+    blocked = (pair for pair in pairs if ways.blocked_by(*pair).count(";") == 1)
+    return ways, list(itertools.islice(blocked, count))
 
 
 @pytest.fixture(scope="module")

@@ -110,6 +110,6 @@ def _own_pairs(links: Capsules, tool: Capsules) -> NDArray[np.int64]:
             last = min(j, count)
             radius_j = links.radius[j] if j < count else tool.radius[j - count]
             between = lengths[i + 1 : last].sum()
-            if between > 1.5 * (links.radius[i] + radius_j):
+            if between > 1.25 * (links.radius[i] + radius_j):
                 pairs.append((i, j))
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)

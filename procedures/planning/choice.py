@@ -66,15 +66,18 @@ class Knowledge:
 def most_informative(pool: Sequence[Knowledge], count: int, known: Knowledge, *, well_spread: bool) -> list[int]:
     """Which ``count`` of the pool to take on top of what is known: D-optimal, and well spread before all if told so.
 
-    Chosen greedily, then one is exchanged for another as long as that helps. Where none is found that is well spread,
-    it is the choice that comes nearest to it.
+    Chosen greedily, by what they tell and by how wide their axes are, then one is exchanged for another as long as
+    that helps; the better of both. Where none is found that is well spread, the choice that comes nearest to it.
     """
-    chosen = _improved(pool, _greedy(pool, count, known, _worth), known, well_spread=well_spread)
-    if not well_spread or Knowledge.together([known, *(pool[i] for i in chosen)]).well_spread:
-        return chosen
-    # Exchanges one at a time may get stuck between: from the widest axes on it is another way.
-    other = _improved(pool, _greedy(pool, count, known, _width), known, well_spread=True)
-    return max(chosen, other, key=lambda numbers: Knowledge.together([known, *(pool[i] for i in numbers)]).spread)
+    starts = (_worth, _width) if well_spread else (_worth,)
+    choices = [_improved(pool, _greedy(pool, count, known, gain), known, well_spread=well_spread) for gain in starts]
+
+    def merit(numbers: Sequence[int]) -> tuple[float, float]:
+        together = Knowledge.together([known, *(pool[i] for i in numbers)])
+        nearness = 1.0 if together.well_spread or not well_spread else together.spread
+        return nearness, float(_worth(together, [Knowledge.together([])])[0])
+
+    return max(choices, key=merit)
 
 
 def _worth(have: Knowledge, left: Sequence[Knowledge]) -> Array:
@@ -122,10 +125,10 @@ def _best_addition(pool: Sequence[Knowledge], chosen: Sequence[int], known: Know
     if not well_spread:
         return left[int(np.argmax(worth))]
     with_one = [Knowledge.together([have, pool[i]]) for i in left]
-    nearness = [min(1.0, k.spread / LEAST_SPREAD) for k in with_one]
+    nearness = np.array([min(1.0, k.spread / LEAST_SPREAD) for k in with_one])
     if have.turn < LEAST_TURN:  # one more never takes a turn away
-        nearness = [near + min(1.0, k.turn / LEAST_TURN) for near, k in zip(nearness, with_one, strict=True)]
-    return left[int(np.lexsort([worth, nearness])[-1])]
+        nearness += [min(1.0, k.turn / LEAST_TURN) for k in with_one]
+    return left[int(np.lexsort((worth, nearness))[-1])]
 
 
 def turned_about_two_axes(R: Array) -> float:

@@ -40,7 +40,7 @@ class Mover:
 
     @staticmethod
     def both(model: CellModel, placement: Placement) -> tuple[Mover, Mover]:
-        """The active arm and the passive one of a cell, with half of what a sample may overlook in the margin."""
+        """The active arm and the passive one; the margin includes what clearance may fall short between samples."""
         n = model.active.chain.joints
         active, passive = (model.active, slice(0, n)), (model.passive, slice(n, None))
         margin = model.margin + BETWEEN_SAMPLES

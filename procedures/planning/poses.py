@@ -19,14 +19,14 @@ from procedures.planning.order import shortest_order
 from procedures.planning.plan import Plan, PlannedConstraint, PlannedPosition
 from procedures.planning.ways import Leg, WayFinder
 
-POINT_SECONDS = 0.5
-"""What pictures and corrections take at a position, besides the way there: two pictures, as measured."""
+POINT_SECONDS = 0.1
+"""What pictures, corrections and settling take at a position besides the way there, as simulated runs have it."""
 
-_POOLS = (3, 6, 12, 24)  # candidates drawn for each constraint of a use; more where fewer do not do
+_POOLS = (6, 12, 24)  # candidates drawn for each constraint of a use; more where fewer do not do
 _LEAST_WHOLE = 6  # constraints that a pool is large enough for, however few are wanted
 _AXES_TRIED = 2000
 _AXES_FOR_ADVICE = 200
-_WAYS_MISSED = 8
+_WAYS_MISSED = 16
 """Constraints that no way leads to, after which the start or the cell is to blame and no longer the candidates."""
 
 _NO_WAY = "no clear way to the constraint"

@@ -16,8 +16,8 @@ from dualcal_hal.transforms import Array
 from procedures.planning.moves import Mover
 from procedures.planning.rrt import connect, shorten
 
-ITERATIONS = 60
-"""Samples towards which a search grows before it gives up, which takes 2 to 3 s."""
+ITERATIONS = 100
+"""Samples towards which a search grows before it gives up, which takes about 3 s for both arms."""
 
 SHORTCUTS = 30
 """Random shortcuts tried on a path that was searched for."""

@@ -354,6 +354,7 @@ _WORDS = {
     "greater_than": "must be greater than {gt:g}",
     "greater_than_equal": "must be at least {ge:g}",
     "less_than": "must be less than {lt:g}",
+    "less_than_equal": "must be at most {le:g}",
     "literal_error": "must be {expected}",
     "too_short": "must have at least {min_length} entry, has {actual_length}",
     "too_long": "must have {max_length} entries, has {actual_length}",

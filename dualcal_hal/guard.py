@@ -32,6 +32,9 @@ PLANNERS_SHARE = 0.5
 So a plan that kept the whole of it, for the same placement, is not refused.
 """
 
+READING_SLACK = 0.001
+"""m by which clearance may seem to fall because joints are read, not known."""
+
 _LIMIT_TOLERANCE = 1e-6  # rad, for what rounding does at a limit
 
 
@@ -70,9 +73,9 @@ class CellGuard:
         active.admit(self._check_active, one_at_a_time)
         passive.admit(self._check_passive, one_at_a_time)
 
-    def place(self, placement: Placement) -> None:
-        """Judge clearance with the bases there from here on; before, it is the nominal placement."""
-        self._placement = placement
+    def place(self, placement: Placement, geometry: CellGeometry) -> None:
+        """Judge clearance with the bases there and these shapes from here on; before, they are the nominal ones."""
+        self._placement, self._geometry = placement, geometry
 
     def _check_active(self, waypoints: Array) -> None:
         other = self._standing(self._passive)
@@ -100,18 +103,29 @@ class CellGuard:
         return state
 
     def _require(self, arm: str, between: Array, own: Array) -> None:
-        for at_samples, what in ((between, "the other arm"), (own, "the floor, a fixture or itself")):
+        if between[0] < BETWEEN_SAMPLES - READING_SLACK:
+            # Every way could lead deeper into what the arm may be touching.
+            why = "the bases may stand so that it touches the other arm, or what stands about that, where it is"
+            raise CommandRefused(arm, "move", why, "nothing was sent; jog the arms apart by hand")
+        for at_samples, what in (
+            (between, "the other arm or what stands about it"),
+            (own, "the floor, a fixture or itself"),
+        ):
             clearance = at_samples - BETWEEN_SAMPLES
-            # An arm that already stands too close to something may move away from that, never closer.
-            allowed = min(self._clearance, float(clearance[0]) - 1e-9)
+            # An arm that already stands too close to something may move away from that, never closer again.
+            reached = np.maximum.accumulate(clearance)
+            allowed = np.minimum(self._clearance, reached - READING_SLACK)
+            if np.all(clearance >= allowed):
+                continue
             least = float(np.min(clearance))
-            if not least >= allowed:
-                raise CommandRefused(
-                    arm,
-                    "move",
-                    f"the path may come within {least * 1e3:.1f} mm of {what}, {allowed * 1e3:.1f} mm are the least",
-                    "nothing was sent; plan anew or check the nominal transforms in the cell file",
-                )
+            if clearance[0] < self._clearance:
+                why = f"it may stand within {clearance[0] * 1e3:.1f} mm of {what}, and the path leads closer"
+                advice = "nothing was sent; jog it away by hand"
+            else:
+                needed = f"{self._clearance * 1e3:.1f} mm are needed"
+                why = f"the path may come within {least * 1e3:.1f} mm of {what}; {needed}"
+                advice = "nothing was sent; plan anew or check the nominal transforms in the cell file"
+            raise CommandRefused(arm, "move", why, advice)
 
 
 class GuardedRobot(Robot):

@@ -56,7 +56,9 @@ class Charuco(Target):
     """A checkerboard with an ArUco marker, ``marker`` m wide, in each white square, which tells where it is.
 
     dictionary: OpenCV's name of the markers' dictionary; white_first: whether the top left square is white and
-    not black, as on boards with an even number of rows of squares printed before OpenCV 4.6.
+    not black, as on boards with an even number of rows of squares printed before OpenCV 4.6. A marker's bit (there are
+    as many in a row as the dictionary's name says, and two of the border) must be 2 px wide in a sharp image, 4 px in
+    one that is blurred by 1.5 px.
     """
 
     marker: float

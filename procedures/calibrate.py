@@ -168,8 +168,9 @@ class Calibration:
                     break
         if len(self._views) < LEAST_VIEWS:
             raise NoPlan(
-                f"first look: {len(self._views)} of {count} looks found the target, {LEAST_VIEWS} are needed "
-                f"({'; '.join(reasons)}); check the nominal transforms, the lighting and that nothing hides the target"
+                f"first look: {len(self._views)} looks found the target, {LEAST_VIEWS} are needed "
+                f"({'; '.join(reasons)}); see the pictures under images/looks; "
+                "check the nominal transforms, the lighting and that nothing hides the target"
             )
 
     def _stand_off(self) -> Procedure[StandOffRecord]:
@@ -178,7 +179,7 @@ class Calibration:
         return StandOffRecord(found.posture)
 
     def _look(self, stand_off: Posture, number: int) -> Procedure[LookRecord]:
-        reason = "no posture for it keeps clear and shows the target"
+        reason, taken = "no posture for it keeps clear and shows the target", 0
         postures = look_postures(self._model, self._belief, self._ways, stand_off, number)
         for posture in itertools.islice(postures, _TRIES_A_LOOK):
             if not (yield from self._go(posture)):
@@ -188,8 +189,11 @@ class Calibration:
                 yield KeepImage(f"looks/{number}", picture.sighting.frame.image)
                 joints = picture.sighting.active, picture.sighting.passive
                 return LookRecord(View(*joints, picture.detection.corners), "")
-            reason = picture.reason
-        return LookRecord(None, reason)
+            reason, taken = picture.reason, taken + 1
+            if picture.sighting is not None:
+                # What the camera saw instead of the target tells what is wrong.
+                yield KeepImage(f"looks/{number}-{taken}", picture.sighting.frame.image)
+        return LookRecord(None, f"{reason} ({taken} pictures)" if taken > 1 else reason)
 
     # -- constraints --------------------------------------------------------------------------------------------
 
@@ -319,8 +323,9 @@ class Calibration:
         """Go on with a belief; without looks, as simulated cells may, it is always taken as exact."""
         belief = belief if self._procedure.first_looks else belief.taken_as_exact()
         self._belief = belief
+        self._model = self._model.believing(belief)
         self._ways = WayFinder(self._model, belief, self._retreats)
-        yield Believe(belief.placement)
+        yield Believe(belief.placement, self._model.geometry)
 
     def _here(self) -> Procedure[Posture]:
         readings = yield from read()

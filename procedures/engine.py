@@ -97,8 +97,8 @@ class Engine:
                 return self._session.write_image(name, image)
             case KeepDocument(file_name, document):
                 return self._session.write_document(file_name, document)
-            case Believe(placement):
-                return self._cell.guard.place(placement)
+            case Believe(placement, geometry):
+                return self._cell.guard.place(placement, geometry)
         raise TypeError(f"{step!r} is no step")
 
     def _task(self, task: Task) -> Any:

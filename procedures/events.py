@@ -35,7 +35,12 @@ class PlanReady:
 
     def __str__(self) -> str:
         uses = {constraint.use: len(self.plan.of(constraint.use)) for constraint in self.plan.constraints}
-        return "plan: " + ", ".join(f"{count} {use} constraints" for use, count in uses.items())
+        spread = self.plan.axis_spread
+        return (
+            "plan: "
+            + ", ".join(f"{count} {use} constraints" for use, count in uses.items())
+            + ("" if spread is None else f", axes spread {spread:.3f}")
+        )
 
 
 @dataclass(frozen=True)

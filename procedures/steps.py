@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, Self, TypeVar
 
 from dualcal_hal.camera import Frame, Image
-from dualcal_hal.geometry import Placement
+from dualcal_hal.geometry import CellGeometry, Placement
 from dualcal_hal.robot import Joints, RobotState
 from dualcal_hal.session.journal import StepKey
 
@@ -77,9 +77,10 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Believe:
-    """From here on the guard judges clearance with the arms' bases placed so."""
+    """From here on the guard judges clearance with the arms' bases placed so and their shapes these."""
 
     placement: Placement
+    geometry: CellGeometry
 
 
 @dataclass(frozen=True, eq=False)

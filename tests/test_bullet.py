@@ -170,6 +170,26 @@ def test_parts_are_as_far_apart_as_the_planners_shapes_are_or_farther(bodies: Bu
         assert nearness.between_arms().distance >= geometry.between(q_a, q_p, placement)[0]
 
 
+@pytest.mark.parametrize("arm", [ACTIVE, PASSIVE])
+def test_an_arm_weighs_about_20_kg(bodies: BulletBodies, arm: str) -> None:
+    masses = [pybullet.getDynamicsInfo(bodies.arms[arm], link, physicsClientId=bodies.client)[0] for link in range(7)]
+    assert min(masses) > 0.05
+    assert 15 < sum(masses) < 25
+
+
+def test_an_arm_whose_motors_are_off_falls(bodies: BulletBodies) -> None:
+    before = bodies.link_pose(*bodies.tool(ACTIVE))[:3, 3]
+    for joint in range(6):
+        pybullet.setJointMotorControl2(
+            bodies.arms[ACTIVE], joint, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=bodies.client
+        )
+    for _ in range(24):
+        bodies.step()
+    after = bodies.link_pose(*bodies.tool(ACTIVE))[:3, 3]
+    # Stretched out ahead, it turns about its shoulder: its end falls a little faster than a stone.
+    assert before[2] - after[2] == pytest.approx(0.5 * 9.81 * 0.1**2, rel=0.5)
+
+
 # Motion
 
 
@@ -297,6 +317,67 @@ def test_an_arm_that_meets_a_fixture_halts(shape: str, tmp_path: Path) -> None:
     with pytest.raises(Contact, match="of right touches post"):
         move(backend, PASSIVE, (np.radians(90), *LEANING[1:]))
     runs.close()
+
+
+def a_ball(path: Path, rings: int, radius: float) -> str:
+    """A fixture beside the passive arm: a mesh of 4 rings (rings - 1) triangles, ``radius`` in mm."""
+    polar = np.linspace(0, np.pi, rings + 1)[1:-1, None]
+    around = np.linspace(0, 2 * np.pi, 2 * rings, endpoint=False)
+    x, y, z = np.broadcast_arrays(np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar))
+    vertices = [*np.stack([x, y, z], axis=-1).reshape(-1, 3), np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])]
+    last, count = len(vertices), 2 * rings
+    ring = 1 + np.arange(rings - 1)[:, None] * count + np.arange(count + 1) % count
+    faces = [
+        face
+        for a, b, c, d in zip(
+            ring[:-1, :-1].flat, ring[:-1, 1:].flat, ring[1:, :-1].flat, ring[1:, 1:].flat, strict=True
+        )
+        for face in ((a, c, b), (b, c, d))
+    ]
+    faces += [(last - 1, a, b) for a, b in itertools.pairwise(ring[0])]
+    faces += [(last, b, a) for a, b in itertools.pairwise(ring[-1])]
+    lines = ["v {} {} {}".format(*(radius * vertex)) for vertex in vertices] + ["f {} {} {}".format(*f) for f in faces]
+    path.write_text("\n".join(lines) + "\n")
+    return f"fixtures={{ball: {{in: passive_base, {POST}, mesh: {{file: {path}}}}}}}"
+
+
+def test_triangles_of_a_mesh_share_their_vertices_so_that_48_000_are_not_too_many(tmp_path: Path) -> None:
+    file = cell(a_ball(tmp_path / "ball.obj", 110, 200.0))
+    backend = next(runs := opened(file))
+    move(backend, PASSIVE, LEANING)
+    with pytest.raises(Contact, match="of right touches ball"):
+        move(backend, PASSIVE, (np.radians(90), *LEANING[1:]))
+    runs.close()
+
+
+def test_a_mesh_that_pybullet_does_not_take_is_refused_by_its_key_and_nothing_is_left_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(**_: object) -> None:
+        raise pybullet.error("createCollisionShape failed.")
+
+    monkeypatch.setattr(pybullet, "createCollisionShape", refuse)
+    backend, before = SimulatorBackend("sim", cell(a_ball(tmp_path / "ball.obj", 10, 200.0))), worlds()
+    with pytest.raises(CellFileError, match=r"fixtures\.ball\.mesh: too many triangles for PyBullet, 360; simplify"):
+        backend.open(TIMEOUT)
+    assert worlds() == before
+
+
+def worlds() -> int:
+    """Clients that PyBullet still serves."""
+    return sum(pybullet.isConnected(client) for client in range(100))
+
+
+@pytest.mark.parametrize("part", ["bullet.stepper.Nearness", "backend.Scene"])
+def test_a_world_that_cannot_be_finished_is_given_up(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ValueError("no")
+
+    monkeypatch.setattr(f"backends.simulator.{part}", fail)
+    before = worlds()
+    with pytest.raises(ValueError, match="no"):
+        SimulatorBackend("sim", cell()).open(TIMEOUT)
+    assert worlds() == before
 
 
 def test_a_cell_whose_arms_touch_at_home_does_not_open() -> None:

@@ -417,7 +417,10 @@ BAD = {
         "simulation.truth.kinematics.left.dh: must have 2 entries, as the arm's own, has 1",
     ),
     "an unknown stepper": (
-        "stepper: kinematic", "stepper: magic", "magic", "simulation.stepper: must be 'kinematic' or 'bullet', not 'magic'",
+        "stepper: kinematic",
+        "stepper: magic",
+        "magic",
+        "simulation.stepper: must be 'kinematic' or 'bullet', not 'magic'",
     ),
     "a key given twice": (
         "name: small", "name: small\nname: large", "name: large", "name: duplicate key, first in line 2",
@@ -767,4 +770,10 @@ def test_a_stand_off_has_an_entry_a_joint(path: Path) -> None:
 
 def test_home_keeps_the_procedures_margin_to_the_limits(path: Path) -> None:
     problems = refused(path, CELL, "robots.left.limit_margin_deg=[0, 100]")
-    assert [problem for problem in problems if "is less than 100 inside its limits" in problem]
+    assert [problem for problem in problems if "is less than limit_margin_deg, 100, inside -90 to 90" in problem]
+
+
+def test_home_keeps_the_margin_that_is_taken_where_none_is_given(path: Path) -> None:
+    problems = refused(path, CELL, "robots.left.home_deg=[0, 89]")
+    assert [problem for problem in problems if "home_deg: joint 2: 89 is less than limit_margin_deg, 3," in problem]
+    assert load_cell(path, ["robots.left.home_deg=[0, 89]", "robots.left.limit_margin_deg=[0, 1]"])

@@ -58,6 +58,13 @@ def test_the_tiny_cell_runs_and_is_verified() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("stepper", ["kinematic", "bullet"])
+def test_the_tiny_cell_runs_with_encoders_that_report_late(stepper: str) -> None:
+    settings = [f"simulation.stepper={stepper}", "simulation.errors.time_skew.delay_s=0.05"]
+    assert run(CELLS / "tiny.yaml", 5, settings).verdict == "ok"
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper-full", "realistic"])
 def test_the_other_examples_run_and_are_verified(name: str) -> None:
     assert run(CELLS / f"{name}.yaml", 1, ["simulation.stepper=kinematic"]).verdict == "ok"

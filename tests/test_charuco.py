@@ -150,6 +150,42 @@ def test_a_blurred_board_is_refused(detector: Detector, facing: Array) -> None:
     assert missed(detector.detect(image, project(BOARD, CAMERA, facing))).reason is Miss.BLURRED
 
 
+def test_markers_that_are_too_small_to_be_read_are_not_taken_for_hidden_ones() -> None:
+    board = Charuco(5, 7, 0.015, 17, 0.011, "DICT_4X4_50")
+    rng = np.random.default_rng(1)
+    scene, detector = Scene(board, CAMERA, rng, blur=1.5, noise=10.0), Detector(board, CAMERA.size)
+    views = [random_view(rng, board, CAMERA) for _ in range(20)]
+    misses = [
+        outcome
+        for view in views
+        if isinstance(outcome := detector.detect(scene.image(view), project(board, CAMERA, view)), Missed)
+    ]
+    assert len(misses) > 10
+    assert {miss.reason for miss in misses} == {Miss.NOT_FOUND}
+    assert sum("markers too small or image too noisy" in miss.detail for miss in misses) > 5
+
+
+@pytest.mark.parametrize(
+    ("marker", "noise", "blur", "found", "rms"),
+    [(0.0125, 2.0, 0.6, 1.0, 0.010), (0.018, 10.0, 1.5, 0.95, 0.05), (0.012, 10.0, 1.5, 0.5, 0.05)],
+)
+def test_corners_are_accurate_and_most_views_found_in_poor_images_too(
+    marker: float, noise: float, blur: float, found: float, rms: float
+) -> None:
+    board = Charuco(4, 4, 0.025, 5, marker, "DICT_4X4_50")
+    rng = np.random.default_rng(1)
+    scene, detector = Scene(board, CAMERA, rng, blur=blur, noise=noise), Detector(board, CAMERA.size)
+    views, errors = 40, []
+    for _ in range(views):
+        T_E_T = random_view(rng, board, CAMERA)
+        truth = project(board, CAMERA, T_E_T)
+        outcome = detector.detect(scene.image(T_E_T), truth)
+        if isinstance(outcome, Detection):
+            errors.append((outcome.corners - truth)[outcome.seen])
+    assert len(errors) >= found * views
+    assert np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0)).max() <= rms
+
+
 def test_another_board_with_other_markers_is_not_this_one(detector: Detector, facing: Array) -> None:
     other = Charuco(4, 4, 0.025, 5, 0.018, "DICT_5X5_50")
     assert missed(detector.detect(Scene(other, CAMERA, np.random.default_rng(7)).image(facing))).reason is (

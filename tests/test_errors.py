@@ -17,19 +17,25 @@ import pytest
 from backends.simulator.mechanics import Approach
 from backends.simulator.truth import Truth
 from backends.simulator.world import World
+from dualcal_hal.cell import Cell
+from dualcal_hal.cellfile import load_cell
 from dualcal_hal.clock import VirtualClock
 from dualcal_hal.config.errors import ErrorsConfig
 from dualcal_hal.config.simulation import NoiseConfig
 from dualcal_hal.errors import CellFileError
-from dualcal_hal.kinematics import random_joints
+from dualcal_hal.guard import STANDSTILL
+from dualcal_hal.kinematics import Chain, random_joints
 from dualcal_hal.robot import JointPath, RobotState
 from dualcal_hal.session.captures import Captures, read_captures
 from dualcal_hal.transforms import Array, inverse, rotation_angle
 from procedures.analysis import analyse
+from tests.cells import PAPER
 from tests.cells import paper_cell as paper_cell_file
+from tests.seen_captures import seen
 from tools.benchmarks.captures import simulated_captures
 from tools.benchmarks.errors import POSES, Errors, Figures, figures, fit_to_all_corners, joint_zero, paper_cell
 
+TINY = PAPER.with_name("tiny.yaml")
 SEEDS = (1, 2, 3)
 ACTIVE, PASSIVE = "left", "right"
 Q_ACTIVE = np.array([0.3, 0.4, -0.5, 0.6, 0.7, -0.8])
@@ -79,6 +85,24 @@ def test_what_is_drawn_belongs_to_the_seed() -> None:
 
 
 # Arms
+
+
+def test_each_denavit_hartenberg_parameter_is_wrong_by_a_normal_error_of_its_own() -> None:
+    known, found = truth({}).chains, []
+    for seed in range(1, 61):
+        wrong = truth({"kinematics": {"angle_deg": 0.1, "length_mm": 0.5}}, seed).chains
+        found.append([np.subtract(parameters(wrong[arm]), parameters(known[arm])) for arm in (ACTIVE, PASSIVE)])
+    errors = np.array(found)  # (60, 2, 6, 5)
+    sigmas = np.tile([np.radians(0.1), 0.5e-3, 0.5e-3, np.radians(0.1), np.radians(0.1)], (2, 6, 1))
+    has_beta = np.array([[row.beta is not None for row in known[arm].rows] for arm in (ACTIVE, PASSIVE)])
+    sigmas[has_beta, 1] = 0.0  # such a row has no d
+    sigmas[~has_beta, 4] = 0.0
+    np.testing.assert_allclose(errors.std(axis=0), sigmas, rtol=0.35)
+
+
+def parameters(chain: Chain) -> Array:
+    """(n, 5): theta, d, a, alpha, beta; 0 for a beta that there is not."""
+    return np.array([(row.theta, row.d, row.a, row.alpha, row.beta or 0.0) for row in chain.rows])
 
 
 @pytest.mark.parametrize(("angle", "length", "expected"), [(0.02, 0.1, 0.8), (0.1, 0.5, 3.5)])
@@ -174,6 +198,14 @@ def test_growth_while_they_warm_up_can_be_seen_and_ends_as_a_scale() -> None:
         np.testing.assert_allclose(T_P_E[:3, 3], cold[:3, 3] + share * (warm - cold)[:3, 3], atol=1e-9)
 
 
+def test_both_arms_warm_up() -> None:
+    grown = truth({"arm_scale": {"ppm": 1000}})
+    warm = truth({"thermal": {"growth_ppm": 1000, "time_constant_min": 10}})
+    np.testing.assert_allclose(
+        warm.T_E_T(Q_ACTIVE, Q_PASSIVE, 36000.0), grown.T_E_T(Q_ACTIVE, Q_PASSIVE, 0.0), rtol=0, atol=1e-9
+    )
+
+
 # Mounts
 
 
@@ -231,6 +263,15 @@ def test_a_target_that_slips_changes_the_captures_from_then_on() -> None:
     assert figures(slip).corners > 0.1
 
 
+def test_a_target_that_slips_is_shifted_and_turned_by_the_stated_length_and_angle() -> None:
+    slipping = truth({"target_slip": {"translation_mm": 2, "rotation_deg": 0.3, "at_s": 100}})
+    before, after = (slipping.T_E_T(Q_ACTIVE, Q_PASSIVE, when) for when in (99.9, 100.0))
+    np.testing.assert_array_equal(before, truth({}).T_E_T(Q_ACTIVE, Q_PASSIVE, 0.0))
+    off = inverse(before) @ after
+    assert np.linalg.norm(off[:3, 3]) == pytest.approx(2e-3)
+    assert rotation_angle(off[:3, :3], np.eye(3)) == pytest.approx(np.radians(0.3))
+
+
 # Time
 
 SWING: Errors = {"settle_time": {"amplitude_mrad": 1, "frequency_hz": 10, "decay_s": 0.1}}
@@ -277,6 +318,61 @@ def test_the_target_trembles_in_the_camera_after_a_move_and_encoders_do_not_show
     assert off[rested][:10].max() > 1e-4
     assert off[times > 1.9].max() < 1e-6
     assert len({state.positions for state, still in zip(states, rested, strict=True) if still}) == 1
+
+
+def test_the_mismatch_grows_with_the_swing_at_the_shutters_opening_and_is_gone_when_it_has_faded() -> None:
+    def mismatch(amplitude_mrad: float, since_rest: float) -> float:
+        swing: Errors = {"settle_time": {"amplitude_mrad": amplitude_mrad, "frequency_hz": 5, "decay_s": 0.1}}
+        return seen(swing, since_rest).mismatch
+
+    small, large = mismatch(0.5, 0.05), mismatch(1.0, 0.05)
+    assert small > 0.05
+    assert large == pytest.approx(2 * small, rel=0.05)
+    assert mismatch(1.0, 1.05) < 0.005
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.05])
+def test_with_skew_the_place_that_the_joints_tell_is_off_by_the_way_of_the_time_and_not_at_rest(delay: float) -> None:
+    """The mismatch of a capture taken on the way; the arms' standing is waited for, so captures of a run have none."""
+    off, rests = [], []
+
+    def look(world: World, when: float) -> None:
+        state = world.arms[ACTIVE].state("read")
+        told, true = (
+            world.truth.T_P_E(q, when)[:3, 3]
+            for q in (np.array(state.positions), world.arms[ACTIVE].true_positions(when))
+        )
+        off.append(float(np.linalg.norm(told - true)))
+        rests.append(not np.any(state.velocities))
+
+    times = np.array(list(moving({"time_skew": {"delay_s": delay}}, look)))
+    speed = np.linalg.norm(np.diff(path_of_the_camera(times), axis=0), axis=1) / 0.01
+    assert max(off) == pytest.approx(delay * speed.max(), rel=0.1)
+    assert max(np.array(off)[np.array(rests) & (times > delay)]) < 1e-9
+
+
+def path_of_the_camera(times: Array) -> Array:
+    """(k, 3) m, of the move that :func:`moving` makes."""
+    places: list[Array] = []
+
+    def look(world: World, when: float) -> None:
+        places.append(world.truth.T_P_E(world.arms[ACTIVE].true_positions(when), when)[:3, 3])
+
+    assert len(list(moving({}, look))) == len(times)
+    return np.array(places)
+
+
+@pytest.mark.parametrize("stepper", ["kinematic", "bullet"])
+def test_with_skew_an_arm_has_settled_once_its_encoders_say_so_and_the_other_may_move(stepper: str) -> None:
+    file = load_cell(TINY, [f"simulation.stepper={stepper}", "simulation.errors.time_skew.delay_s=0.05"])
+    with Cell(file) as cell:
+        for offset in (0.1, -0.1, 0.05):
+            for arm in (cell.active, cell.passive):
+                target = tuple((np.array(arm.home) + [offset, 0, 0, 0, offset, 0]).tolist())
+                path = JointPath((target,), tuple(arm.limits.speed), tuple(arm.limits.acceleration))
+                state = arm.robot.start(path).wait(30.0)
+                assert np.abs(state.velocities).max() < STANDSTILL
+                np.testing.assert_allclose(state.positions, target, atol=1e-4)
 
 
 def test_a_state_with_skew_says_where_the_joints_were_earlier() -> None:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dualcal_hal.errors import NoPlan
+from dualcal_hal.geometry.exact import ExactCell
 from dualcal_hal.transforms import rotation_from_vector, transform
 from procedures.planning.first_look import find_stand_off, look_postures
 from procedures.planning.model import CellModel, Posture
+from procedures.planning.refine import LEAST_VIEWS, View, refine
 from procedures.planning.ways import WayFinder
 from tests.cells import paper_cell
 from tests.walking import least_clearance, seen_from_camera, walk
@@ -102,13 +107,57 @@ def test_a_given_stand_off_beyond_the_procedures_limits_is_refused(model, stand_
 
 
 def test_bases_that_stand_above_each_other_have_no_stand_off():
-    with pytest.raises(NoPlan, match="above each other"):
+    with pytest.raises(NoPlan, match=r"above each other.*move one of them sideways, or give procedure\.stand_off"):
         found_from(Posture(HOME, HOME), "nominal.active_base_in_passive_base.translation_mm=[0, 0, 1200]")
 
 
 def test_bases_too_close_for_the_error_allowed_have_no_stand_off_and_are_told_to_move_apart():
-    with pytest.raises(NoPlan, match=r"no stand-off.*What would help most: move the bases \d+ mm farther apart"):
+    with pytest.raises(NoPlan) as refusal:
         found_from(Posture(HOME, HOME), "nominal.active_base_in_passive_base.translation_mm=[600, 0, 0]")
+    why = str(refusal.value)
+    assert "the arms are too close to each other: " in why
+    assert "What would help most: move the bases " in why
+    assert "mm farther apart; or give procedure.stand_off" in why
+
+
+@pytest.mark.slow
+def test_a_camera_that_looks_back_at_its_arm_has_no_stand_off_and_is_to_be_mounted_the_other_way():
+    with pytest.raises(
+        NoPlan, match=r"Refused: .*What would help most: mount the camera on 'left' so that it looks away"
+    ):
+        found_from(Posture(HOME, HOME), "nominal.camera_in_active_flange.rotation_vector_deg=[180, 0, 0]")
+
+
+def test_of_the_stand_offs_compared_the_one_is_taken_from_which_most_looks_can_follow(
+    model, ways, stand_off, monkeypatch
+):
+    compared = []
+
+    def looks(model, belief, ways, at, number, refused=None):
+        """As if none could be taken but from the last that was asked about before."""
+        if compared and at == compared[-1]:
+            yield at
+
+    def noted(model, belief, ways, at, number, refused=None):
+        compared.append(at)
+        return iter(())
+
+    monkeypatch.setattr("procedures.planning.first_look.look_postures", noted)
+    assert find_stand_off(model, model.nominal, ways, model.home, 1).posture == compared[0]
+    assert compared[-1] != compared[0]
+    monkeypatch.setattr("procedures.planning.first_look.look_postures", looks)
+    assert find_stand_off(model, model.nominal, ways, model.home, 1).posture == compared[-1]
+
+
+def test_a_stand_off_that_is_too_close_in_the_true_shapes_is_not_taken(model, ways, stand_off, monkeypatch):
+    """As if the shape of something were not inside its capsules where both arms stand best."""
+    exact = ExactCell.clearance
+
+    def narrower(self, q_a, q_p, T_P_A):
+        return 0.019 if Posture.of(q_a, q_p) == stand_off.posture else exact(self, q_a, q_p, T_P_A)
+
+    monkeypatch.setattr(ExactCell, "clearance", narrower)
+    assert find_stand_off(model, model.nominal, ways, model.home, 1).posture != stand_off.posture
 
 
 @pytest.mark.parametrize(
@@ -163,3 +212,55 @@ def test_where_the_board_is_not_seen_the_camera_is_tilted_in_two_rings_and_the_p
         np.testing.assert_allclose(camera[:3, 3], at[:3, 3], atol=1e-8)
         tilts.append(np.rad2deg(np.arccos(camera[:3, 2] @ at[:3, 2])))
     np.testing.assert_allclose(tilts, [12.0] * 8 + [20.0] * 8, atol=1e-3)
+
+
+def test_no_look_is_taken_at_a_board_that_something_hides(model, stand_off):
+    """A thin post on the line between lens and board, clear of both arms."""
+    belief = model.nominal.as_if_looked()
+    lens = model.camera_in_passive(stand_off.posture.active, belief)[:3, 3]
+    middle = (lens + model.target_in_passive(stand_off.posture.passive)[:3, 3]) / 2
+    at = f"at: {{translation_mm: {(1e3 * middle).tolist()}, rotation_vector_deg: [0, 0, 0]}}"
+    post = f"fixtures={{post: {{in: passive_base, {at}, cylinder_mm: {{radius: 3, length: 100}}}}}}"
+    behind = CellModel(paper_cell(post).cell).believing(belief)
+    ways = WayFinder(behind, belief, [])
+    assert behind.geometry.clearance([stand_off.posture.active], [stand_off.posture.passive], belief.placement) > 0.02
+    for number in (0, 1, 2):
+        refused = Counter()
+        postures = list(look_postures(behind, belief, ways, stand_off.posture, number, refused))
+        assert postures == ([stand_off.posture] if number == 0 else [])
+        assert refused["an arm or a fixture hides the target"] >= 8
+
+
+def test_postures_that_will_not_do_for_a_look_are_counted_with_the_reason(model, ways):
+    home = Posture(HOME, HOME)
+    refused = Counter()
+    postures = list(look_postures(model, model.nominal, ways, home, 1, refused))
+    assert not postures
+    assert refused["'right' does not get there"] == 8
+
+
+# -- what the looks tell --------------------------------------------------------------------------------
+
+
+def seen_by(model, truth, postures):
+    return [View(p.active, p.passive, model.predict_corners(p.active, p.passive, truth)) for p in postures]
+
+
+def test_before_three_views_what_is_kept_clear_of_is_all_that_the_cell_file_allows(model, ways, stand_off):
+    """However much less the fit says: with so few views it may be in a wrong place."""
+    wide = CellModel(paper_cell("nominal.uncertainty={translation_mm: 300, rotation_deg: 25}").cell)
+    error = transform(rotation_from_vector([0, 0, 0.05]), [0.05, 0, 0])
+    truth = replace(model.nominal, T_P_A=model.nominal.T_P_A @ error)
+    looks = [
+        next(look_postures(model, model.nominal, ways, stand_off.posture, number)) for number in range(LEAST_VIEWS)
+    ]
+    views = seen_by(model, truth, looks)
+    for count in range(1, LEAST_VIEWS):
+        belief, _ = refine(wide, views[:count])
+        assert belief.placement is wide.nominal.placement
+    belief, rms = refine(wide, views)
+    assert rms < 1e-3
+    np.testing.assert_allclose(belief.T_P_A, truth.T_P_A, atol=1e-3)
+    np.testing.assert_array_equal(belief.placement.T_P_A, belief.T_P_A)
+    assert 0.015 <= belief.placement.translation < 0.05
+    assert np.deg2rad(0.6) <= belief.placement.rotation < np.deg2rad(3.0)

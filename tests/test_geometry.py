@@ -25,6 +25,7 @@ from dualcal_hal.geometry import (
     plate_capsules,
     segment_distance,
 )
+from dualcal_hal.geometry.body import LEAST_APART
 from dualcal_hal.geometry.exact import ExactCell
 from dualcal_hal.target import Checkerboard
 from dualcal_hal.transforms import apply, rotation_from_vector, smallest_rotation, transform
@@ -326,3 +327,63 @@ def test_links_are_the_same_in_both():
     expected = links_alone.between([q_a], [q_p], Placement(near))[0]
     assert capsules.clearance([q_a], [q_p], Placement(near))[0] == pytest.approx(expected, abs=1e-9)
     assert exact.clearance(q_a, q_p, near) == pytest.approx(expected, abs=1e-6)
+
+
+# Parts of one arm
+
+
+def own_parts(clearance: float) -> ArmBody:
+    """The passive arm of the paper's cell with its plate, which is to keep this clearance to itself."""
+    links = link_capsules(PASSIVE, [0.055, 0.055, 0.055, 0.045, 0.045, 0.045])
+    return ArmBody(PASSIVE, links, plate_capsules(6, T_F_T, BOARD.outline), None, clearance=clearance)
+
+
+def part_distances(body: ArmBody, q: np.ndarray, first: int, second: int) -> np.ndarray:
+    """Between links, or a link and all that the arm carries, one by one."""
+    segments = body.segments(q)
+    others = range(len(body.links), len(body.capsules)) if second == len(body.links) else [second]
+    return np.min(
+        [
+            segment_distance(segments[:, first], segments[:, j]) - body.capsules.radius[first] - body.capsules.radius[j]
+            for j in others
+        ],
+        axis=0,
+    )
+
+
+def test_any_two_parts_of_an_arm_that_some_posture_brings_apart_are_held_against_each_other() -> None:
+    body = own_parts(0.02)
+    q = np.random.default_rng(3).uniform(-np.pi, np.pi, (600, 6))
+    count = len(body.links)
+    held = {(i, min(j, count)) for i, j in body.pairs.tolist()}
+    for i in range(count):
+        for j in range(i + 2, count + 1):
+            possible = part_distances(body, q, i, j).max()
+            if abs(possible - LEAST_APART) > 0.002:
+                assert ((i, j) in held) == (possible > LEAST_APART), (i, j, possible)
+
+
+def test_parts_built_closer_together_than_the_clearance_need_half_of_what_is_possible() -> None:
+    body = own_parts(0.02)
+    close = {
+        (i, min(j, len(body.links))): r for (i, j), r in zip(body.pairs.tolist(), body.relief, strict=True) if r > 0
+    }
+    assert close
+    q = np.random.default_rng(4).uniform(-np.pi, np.pi, (2000, 6))
+    for (i, j), relief in close.items():
+        distance = part_distances(body, q, i, j)
+        needed = 0.02 + BETWEEN_SAMPLES - relief
+        assert needed == pytest.approx(distance.max() / 2, abs=0.002)
+        assert 0 < needed < 0.02 + BETWEEN_SAMPLES
+    assert np.any(body.relief == 0.0)
+    assert not np.any(own_parts(0.0).relief > BETWEEN_SAMPLES)
+
+
+def test_the_cameras_housing_stands_where_it_is_believed_and_may_be_made_thicker() -> None:
+    cell = paper_cell().cell
+    nominal, thick = CellGeometry.of(cell), CellGeometry.of(cell, camera_error=0.015)
+    moved = CellGeometry.of(cell, T_H_E=cell.nominal.T_H_E @ transform(np.eye(3), [0.0, 0.0, 0.05]))
+    np.testing.assert_allclose(thick.active.tool.radius - nominal.active.tool.radius, 0.015)
+    np.testing.assert_allclose(thick.active.tool.ends, nominal.active.tool.ends)
+    along = cell.nominal.T_H_E[:3, 2] * 0.05
+    np.testing.assert_allclose(moved.active.tool.ends - nominal.active.tool.ends, np.broadcast_to(along, (1, 2, 3)))

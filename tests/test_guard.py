@@ -166,7 +166,7 @@ def open_cell():
 @pytest.fixture
 def cell(open_cell):
     """The cell with its bases known to stand as in the cell file."""
-    open_cell.guard.place(Placement(NOMINAL))
+    open_cell.guard.place(Placement(NOMINAL), GEOMETRY)
     return open_cell
 
 
@@ -207,7 +207,7 @@ def test_where_the_other_arm_stands_follows_from_the_transforms_believed_now(cel
     go(cell.active, REACHING)
     far = NOMINAL.copy()
     far[0, 3] += 1.0
-    cell.guard.place(Placement(far))
+    cell.guard.place(Placement(far), GEOMETRY)
     go(cell.passive, REACHING)
 
 
@@ -217,7 +217,7 @@ def test_as_long_as_the_bases_are_uncertain_the_arms_keep_clear_for_every_error(
     assert GEOMETRY.between([REACHING], [halfway], Placement(NOMINAL))[0] > 0.1
     with pytest.raises(CommandRefused, match=r"may come within .* mm of the other arm"):
         open_cell.passive.robot.start(full_speed(open_cell.passive, halfway))
-    open_cell.guard.place(Placement(NOMINAL, 0.015, np.deg2rad(0.6)))
+    open_cell.guard.place(Placement(NOMINAL, 0.015, np.deg2rad(0.6)), GEOMETRY)
     go(open_cell.passive, halfway)
 
 
@@ -297,12 +297,42 @@ def test_what_keeps_the_planners_clearance_is_never_refused():
     assert judged > 10
 
 
+def standing_close(least, most):
+    """A bend of the passive arm, opposite the reaching active one, at which the exact distance is in this range (m)."""
+    for bend in np.linspace(-0.3, -1.2, 900):
+        close = (0.0, float(bend), 0.8, 0.0, 0.0, 0.0)
+        if least < GEOMETRY.between([REACHING], [close], Placement(NOMINAL))[0] < most:
+            return float(bend)
+    raise AssertionError("no such posture")
+
+
+def bent(bend):
+    return (0.0, bend, 0.8, 0.0, 0.0, 0.0)
+
+
 def test_an_arm_that_stands_too_close_may_move_away_but_no_closer():
-    close, closer, away = ((0.0, bend, 0.8, 0.0, 0.0, 0.0) for bend in (-0.5, -0.55, -0.3))
-    placement = Placement(NOMINAL, 0.12, np.deg2rad(12))
-    assert GEOMETRY.between([REACHING], [close], placement)[0] < 0
-    (_, passive), (_, device), _ = placed_arms(REACHING, close, placement)
-    with pytest.raises(CommandRefused, match="the other arm"):
-        move(passive, CONFIG.passive, closer)
-    move(passive, CONFIG.passive, away)
+    bend = standing_close(0.007, 0.010)
+    (_, passive), (_, device), _ = placed_arms(REACHING, bent(bend), Placement(NOMINAL))
+    with pytest.raises(CommandRefused, match="leads closer"):
+        move(passive, CONFIG.passive, bent(bend - 0.05))
+    move(passive, CONFIG.passive, bent(bend + 0.2))
     assert len(device.sent) == 1
+
+
+def test_an_arm_that_stands_too_close_may_not_come_back_on_its_way():
+    bend = standing_close(0.007, 0.010)
+    (_, passive), (_, device), _ = placed_arms(REACHING, bent(bend), Placement(NOMINAL))
+    with pytest.raises(CommandRefused, match="leads closer"):
+        move(passive, CONFIG.passive, bent(bend + 0.2), bent(bend + 0.001))
+    assert device.sent == []
+
+
+def test_an_arm_that_may_be_touching_the_other_for_an_error_of_the_bases_is_jogged_by_hand():
+    bend = -0.5
+    placement = Placement(NOMINAL, 0.12, np.deg2rad(12))
+    assert GEOMETRY.between([REACHING], [bent(bend)], Placement(NOMINAL))[0] > 0.05
+    assert GEOMETRY.between([REACHING], [bent(bend)], placement)[0] < 0
+    (_, passive), (_, device), _ = placed_arms(REACHING, bent(bend), placement)
+    with pytest.raises(CommandRefused, match="jog"):
+        move(passive, CONFIG.passive, bent(-0.3))
+    assert device.sent == []

@@ -14,10 +14,12 @@ from backends.simulator.pattern import Values
 from backends.simulator.rendering import BLACK, WHITE, Renderer
 from backends.simulator.surface import Surface
 from dualcal_hal.config.image_errors import ImageErrorsConfig
+from dualcal_hal.errors import CellFileError, UsageError
 from dualcal_hal.robot import JointPath
 from dualcal_hal.transforms import Array, inverse, rotation_from_vector, transform
 from tests.cells import NOISELESS, paper_cell
 from tests.rendered_corners import BOARD, CAMERA, FACING, MARGIN, corners_found, project, random_view
+from tests.seen_captures import Seen, seen
 
 AHEAD = transform(FACING, [0.0, 0.0, 0.4])
 TILTED = transform(rotation_from_vector([0.4, -0.3, 0.5]) @ FACING, [0.06, -0.03, 0.4])
@@ -194,3 +196,74 @@ def test_a_frame_exposed_while_an_arm_moves_is_smeared_along_its_motion() -> Non
     along, across = np.divide(sharpness[20.0], sharpness[0.0])
     assert along < 0.3
     assert across > 0.9
+
+
+# The mismatch, of corners detected in images with the same noise
+
+
+@pytest.fixture(scope="module")
+def undisturbed() -> Seen:
+    return seen({})
+
+
+@pytest.mark.parametrize(
+    "lighting",
+    [
+        {"contrast_loss_percent": 80.0},
+        {"gradient_percent": 50.0},
+        {"glare_grey": 60.0, "glare_radius_percent": 3.0, "glare_position_percent": (52.0, 52.0)},
+    ],
+    ids=lambda lighting: next(iter(lighting)),
+)
+def test_poor_light_moves_corners_and_the_mismatch_grows(lighting: dict[str, object], undisturbed: Seen) -> None:
+    """By some micrometres: what the detector finds at all, it finds well."""
+    found = seen({"lighting": lighting})
+    assert found.corners > 3 * undisturbed.corners
+    assert 3 * undisturbed.mismatch < found.mismatch < 0.02
+
+
+def test_defocus_makes_corners_and_the_mismatch_a_little_worse_as_long_as_they_are_found(undisturbed: Seen) -> None:
+    found = seen({"defocus": {"px_per_dioptre": 2.0, "focus_mm": 300.0}})
+    assert undisturbed.corners < found.corners < 3 * undisturbed.corners
+    assert undisturbed.mismatch < found.mismatch < 0.01
+
+
+def test_the_mismatch_grows_with_the_exposure_while_links_still_swing(undisturbed: Seen) -> None:
+    """The links are at rest's place as the shutter opens, and leave it meanwhile; of arms that stand nothing grows."""
+    swing = {"amplitude_mrad": 2.0, "frequency_hz": 5.0, "decay_s": 1.0}
+    short, long = (seen({"settle_time": swing, "motion_blur": {"exposure_ms": ms}}) for ms in (10.0, 20.0))
+    assert short.mismatch > 0.03
+    assert long.mismatch == pytest.approx(2 * short.mismatch, rel=0.1)
+    assert seen({"motion_blur": {"exposure_ms": 20.0}}) == undisturbed
+
+
+# What cannot be
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("arm_scale.ppm=-1e6", "must be at least -100000"),
+        ("thermal.growth_ppm=2e5", "must be at most 100000"),
+        ("focal.x_ppm=-1e6", "must be at least -100000"),
+        ("square_scale.x_ppm=-2e6", "must be at least -100000"),
+        ("motion_blur.exposure_ms=100000", "must be at most 1000"),
+        ("time_skew.delay_s=2", "must be at most 1"),
+    ],
+)
+def test_errors_beyond_all_reason_are_refused_by_their_key(setting: str, told: str) -> None:
+    with pytest.raises(CellFileError) as refused:
+        paper_cell(f"simulation.errors.{setting}")
+    key = setting.partition("=")[0]
+    assert str(refused.value).startswith(f"--set simulation.errors.{key}: {told}, not ")
+
+
+def test_a_distortion_that_the_errors_make_impossible_is_not_blamed_on_the_cameras_own() -> None:
+    with pytest.raises(UsageError, match=r"^simulation\.errors\.distortion_residual: "):
+        renderer(distortion_residual={"corner_px": -500.0})
+
+
+@pytest.mark.parametrize("depth", [0.0, 1e-9, -0.3])
+def test_a_target_in_the_lens_or_behind_it_is_blurred_like_one_near_by(depth: float) -> None:
+    defocus = with_errors(defocus={"px_per_dioptre": 4.0, "focus_mm": 400.0}).defocus
+    assert defocus.sigma(depth) == defocus.sigma(0.1) == pytest.approx(4.0 * 7.5)

@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 
 from dualcal_hal.errors import NoPlan
 from dualcal_hal.geometry.exact import ExactCell
+from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import inverse, rotation_from_vector, transform
 from procedures.calibrate import requests_of
+from procedures.planning.advice import advice
 from procedures.planning.candidates import ROOM
 from procedures.planning.choice import LEAST_SPREAD, LEAST_TURN, Knowledge, most_informative, turned_about_two_axes
 from procedures.planning.model import CellModel, Posture
@@ -213,6 +215,22 @@ def test_a_replacement_keeps_the_spread_and_the_turns_together_with_what_is_capt
     assert turned_about_two_axes(R) >= LEAST_TURN
 
 
+def ask_for_more_spread_than_there_is(monkeypatch):
+    for module in ("choice", "poses"):
+        monkeypatch.setattr(f"procedures.planning.{module}.LEAST_SPREAD", 0.34)
+
+
+def test_where_no_replacement_spreads_the_axes_the_run_goes_on_with_the_best_there_is(
+    model, belief, ways, plan, monkeypatch
+):
+    ask_for_more_spread_than_there_is(monkeypatch)
+    missing = Request("calibration", 1, POSITIONS, 7, plan.of("calibration")[:6])
+    again = PosePlanner(model, belief, ways, [1]).plan([missing], model.home, provisional=False)
+    assert len(again.constraints) == 1
+    assert again.axis_spread > 0.09
+    assert again.refused["the axes of the best choice do not spread"] >= 3
+
+
 def told_by(axis, rng, flange=None):
     J = rng.standard_normal((8, 12))
     R = rotation_from_vector(rng.uniform(-1, 1, 3)) if flange is None else flange
@@ -310,6 +328,14 @@ def test_the_same_seed_gives_the_same_plan_and_another_seed_another(cell, ways, 
     assert made(cell, ways, seed=2) != plan
 
 
+def test_a_plan_in_part_replaced_is_planned_from_the_transforms_believed_then(plan):
+    gone, kept = plan.constraints[0], plan.constraints[1:]
+    later = replace(plan, constraints=(replace(gone, name="calibration/07"),), planned_from="12 views")
+    both = plan.replaced([gone], later)
+    assert both.constraints == (*kept, *later.constraints)
+    assert both.planned_from == "12 views"
+
+
 def test_a_plan_survives_its_file_to_the_last_bit(plan):
     assert Plan.from_record(json.loads(json.dumps(plan.to_record()))) == plan
 
@@ -351,13 +377,52 @@ def test_positions_without_a_clear_way_between_them_are_counted(cell, ways, monk
 def test_constraints_that_no_way_leads_to_are_given_up_with_what_is_in_the_way(cell, ways, monkeypatch):
     monkeypatch.setattr(WayFinder, "find", lambda self, start, goal: None)
     monkeypatch.setattr(WayFinder, "blocked_by", lambda self, start, goal: "a pillar stands there")
-    with pytest.raises(NoPlan, match=r"17 constraints that no clear way leads to.*a pillar stands there"):
+    with pytest.raises(NoPlan) as refusal:
+        made(cell, ways)
+    why = str(refusal.value)
+    assert "17 calibration constraints that no clear way leads to, the last one because a pillar stands there" in why
+    assert "no clear way to the constraint: 17" in why
+    assert "the passive arm does not reach the position: " in why
+    assert why.endswith("No single change of those tried would help")
+
+
+def test_where_no_way_leads_to_constraints_the_change_that_opens_one_is_named(cell, ways, monkeypatch):
+    """As if no way were free unless the bases stand farther apart."""
+    apart = np.linalg.norm(ways._T_P_A[:3, 3])
+    monkeypatch.setattr(WayFinder, "find", lambda self, start, goal: None)
+    monkeypatch.setattr(
+        WayFinder,
+        "blocked_by",
+        lambda self, start, goal: "" if np.linalg.norm(self._T_P_A[:3, 3]) > 1.01 * apart else "a pillar",
+    )
+    with pytest.raises(NoPlan, match=r"What would help most: move the bases 1\d\d mm farther apart"):
         made(cell, ways)
 
 
+def test_ways_missed_for_one_request_are_not_held_against_the_next(cell, ways, monkeypatch):
+    """Ten candidates of each use have no way, then all do: twenty misses are not the seventeen of one."""
+    find, missed = WayFinder.find, {"calibration": 0, "verification": 0}
+    visit = PosePlanner._visitable
+
+    def told(self, pool, request, known, start, *, insist):
+        self._ways.use = request.use
+        return visit(self, pool, request, known, start, insist=insist)
+
+    def sometimes(self, start, goal):
+        if missed[self.use] < 10:
+            missed[self.use] += 1
+            return None
+        return find(self, start, goal)
+
+    monkeypatch.setattr(PosePlanner, "_visitable", told)
+    monkeypatch.setattr(WayFinder, "find", sometimes)
+    plan = made(cell, WayFinder(CellModel(cell), CellModel(cell).nominal.as_if_looked(), []))
+    assert missed == {"calibration": 10, "verification": 10}
+    assert plan.refused["no clear way to the constraint"] == 20
+
+
 def test_axes_that_cannot_spread_are_counted(cell, ways, monkeypatch):
-    for module in ("choice", "poses"):
-        monkeypatch.setattr(f"procedures.planning.{module}.LEAST_SPREAD", 0.34)
+    ask_for_more_spread_than_there_is(monkeypatch)
     with pytest.raises(NoPlan, match=r"no choice of them will do.*the axes of the best choice do not spread: 3"):
         made(cell, ways)
 
@@ -367,6 +432,44 @@ def test_bases_too_far_apart_are_refused_with_counts_and_shall_come_closer():
     assert "0 candidates for 7 calibration constraints with 4 positions" in why
     assert "the axis misses what the passive arm reaches: " in why
     assert "What would help most: move the bases 440 mm closer together" in why
+
+
+def test_bases_so_far_apart_that_a_fifth_less_is_too_far_as_well_shall_come_closer_by_more():
+    why = refused("nominal.active_base_in_passive_base.translation_mm=[3000, 0, 0]")
+    assert "What would help most: move the bases 1500 mm closer together" in why
+
+
+def test_a_request_of_which_nothing_is_possible_is_refused_before_it_is_planned_as_it_would_be_then(
+    model, belief, ways
+):
+    request = Request("calibration", 7, POSITIONS)
+    PosePlanner(model, belief, ways, [1]).require_candidates(request)
+    far = CellModel(paper_cell("nominal.active_base_in_passive_base.translation_mm=[3000, 0, 0]").cell)
+    with pytest.raises(NoPlan, match=r"0 candidates for 7 calibration.*reaches: \d+.*1500 mm closer together"):
+        PosePlanner(far, far.nominal.as_if_looked(), ways, [1]).require_candidates(request)
+
+
+def test_an_arm_of_five_joints_is_named_as_what_to_change(model):
+    chain = Chain(model.passive.chain.rows[:5])
+    short = model.but(passive=replace(model.passive, chain=chain))
+    said = advice(short, model.nominal, lambda model, belief: 0.0)
+    assert said.startswith("What would help most: an arm of 6 joints in place of 'right', whose 5 cannot")
+
+
+def test_of_the_changes_that_help_the_best_is_named_and_far_moves_of_the_bases_only_where_nothing_else_helps(model):
+    def apart(belief):
+        return float(np.linalg.norm(belief.T_P_A[:3, 3]))
+
+    now = apart(model.nominal)
+    assert "1200 mm farther" in advice(model, model.nominal, lambda _, belief: float(apart(belief) > 1.9 * now))
+    both = advice(
+        model, model.nominal, lambda other, belief: 9 * (apart(belief) < 0.6 * now) + (other.margin < model.margin)
+    )
+    assert both == "What would help most: lower procedure.clearance_mm to 10"
+    more = advice(
+        model, model.nominal, lambda other, belief: 2 * (other.distance[0] < model.distance[0]) + (apart(belief) < now)
+    )
+    assert "widen procedure.distance_mm" in more
 
 
 @pytest.mark.slow

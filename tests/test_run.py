@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import re
 import shlex
@@ -21,7 +22,7 @@ from typer.testing import CliRunner
 from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import load_cell
 from dualcal_hal.errors import LinkLost, NotOpen
-from dualcal_hal.guard import GuardedRobot
+from dualcal_hal.guard import CellGuard, GuardedRobot
 from dualcal_hal.session.captures import read_captures
 from dualcal_hal.session.folder import Session
 from procedures.calibrate import Calibration, captures_of
@@ -126,7 +127,7 @@ def test_the_result_is_complete_and_near_the_truth(session):
 def test_the_output_shows_progress_and_both_tables(session):
     output = (session / "output.txt").read_text()
     assert re.search(r"calibration/\d\d position 1/3: aligned after \d pictures, offset 0\.\d+ px", output)
-    for words in ("w_x", "dp_P_A_y", "113.00", "Mismatch", "60.8", "Verdict: ok", str(session)):
+    for words in ("w_x", "dp_P_A_y", "113.00", "axes spread 0.1", "Mismatch", "60.8", "Verdict: ok", str(session)):
         assert words in output
 
 
@@ -154,7 +155,12 @@ def test_another_seed_gives_other_poses(session, tmp_path):
 
 def test_without_noise_the_mismatch_vanishes(tmp_path):
     result = dualcal(
-        "run", PAPER, "--json", "--out", tmp_path / "s", *sets(*SMALL, *NOISELESS, "procedure.tolerance_px=0.01")
+        "run",
+        PAPER,
+        "--json",
+        "--out",
+        tmp_path / "s",
+        *sets(*SMALL, *NOISELESS, "procedure.constraints=5", "procedure.tolerance_px=0.01"),
     )
     assert result.exit_code == 0
     assert json.loads(result.stdout)["mismatch_mm"]["after"]["mean"] <= 0.01
@@ -183,6 +189,27 @@ def test_what_the_belief_has_outdated_is_planned_anew_and_the_plan_says_so(tmp_p
     plan = json.loads((tmp_path / "s" / "plan.json").read_text())
     captured = {capture.constraint for capture in read_captures(tmp_path / "s" / "captures.json").captures}
     assert captured <= {constraint["constraint"] for constraint in plan["constraints"]}
+
+
+def test_every_look_from_the_third_on_and_every_constraint_gives_other_transforms_to_plan_with(tmp_path, monkeypatch):
+    place, placements = CellGuard.place, []
+
+    def noted(self, placement, *shapes):
+        placements.append(placement)
+        place(self, placement, *shapes)
+
+    monkeypatch.setattr(CellGuard, "place", noted)
+    file = load_cell(PAPER, SMALL)
+    execute(Cell(file), Calibration(file.cell, CellModel(file.cell)), Session.create(tmp_path / "s", file.text), print)
+    begin, stand_off, *looks, first, second, third, verification = (placement.T_P_A for placement in placements)
+    assert len(looks) == 3
+    for before_three_views in (begin, stand_off, *looks[:2]):
+        np.testing.assert_array_equal(before_three_views, file.cell.nominal.T_P_A)
+    fitted = [looks[2], first, second, third, verification]
+    for before, after in itertools.pairwise(fitted):
+        assert np.max(np.abs(after - before)) > 1e-6
+    off = [np.linalg.norm((T_P_A - file.simulation.truth.T_P_A)[:3, 3]) for T_P_A in fitted]
+    assert off[-1] < 0.003 < np.linalg.norm((begin - file.simulation.truth.T_P_A)[:3, 3])
 
 
 def test_on_a_good_end_both_arms_are_home_again_and_the_devices_closed(tmp_path):
@@ -248,7 +275,7 @@ def test_a_mismatch_above_the_limit_fails(tmp_path):
     assert (result.exit_code, json.loads(result.stdout)["verdict"]) == (1, "fail")
 
 
-def test_a_board_of_another_size_than_told_is_noticed_before_anything_is_planned(tmp_path, monkeypatch):
+def test_a_board_of_another_size_than_told_ends_the_run_with_what_to_check(tmp_path, monkeypatch):
     from backends.simulator.world import World
 
     monkeypatch.setattr(World, "T_E_T", _further_away(World.T_E_T))
@@ -334,11 +361,51 @@ def test_a_dry_run_without_a_plan_from_the_nominal_still_shows_the_looks(monkeyp
     assert "no plan: 0 of 3" in result.stdout
 
 
-def test_a_dry_run_without_a_stand_off_fails():
-    far = "nominal.active_base_in_passive_base.translation_mm=[0, 0, 1200]"
-    result = dualcal("run", PAPER, "--dry-run", *sets(*SMALL, far))
+HOME_AS_STAND_OFF = (
+    "procedure.first_looks=5",
+    "procedure.stand_off={active_deg: [0, 0, 60, 0, 30, 0], passive_deg: [0, 0, 60, 0, 30, 0]}",
+)
+
+
+def test_a_dry_run_tells_of_a_look_that_will_be_missed_and_goes_on_as_the_run_does(tmp_path):
+    dry = dualcal("run", PAPER, "--dry-run", *sets(*SMALL, *HOME_AS_STAND_OFF))
+    assert dry.exit_code == 0
+    assert "Look 2 of 5 is missed: no posture for it will do. Refused: 'right' does not get" in dry.stdout
+    assert "Look 3 of 5\n" in dry.stdout
+    run = dualcal("run", PAPER, "--out", tmp_path / "s", *sets(*SMALL, *HOME_AS_STAND_OFF))
+    assert run.exit_code == 0
+    assert "look 2/5: no posture" in run.stdout
+    assert "look 3/5: target found" in run.stdout
+
+
+def test_a_dry_run_with_fewer_than_three_looks_is_refused_with_the_reasons_and_what_to_do():
+    result = dualcal("run", PAPER, "--dry-run", *sets(*SMALL, *HOME_AS_STAND_OFF, "procedure.first_looks=3"))
     assert result.exit_code == 2
-    assert "stand-off" in result.stderr
+    assert "2 of 3 looks can be taken, 3 are needed (look 2: no posture for it will do. Refused: " in result.stderr
+    assert "give another procedure.stand_off" in result.stderr
+
+
+@pytest.mark.parametrize("dry", [True, False])
+def test_where_the_bases_are_too_far_apart_neither_a_dry_run_nor_a_run_goes_as_far_as_to_move(
+    dry, tmp_path, monkeypatch
+):
+    from backends.simulator import SimulatorBackend
+
+    monkeypatch.setattr(SimulatorBackend, "open", lambda self, timeout: pytest.fail("a device was opened"))
+    far = "nominal.active_base_in_passive_base.translation_mm=[3000, 0, 0]"
+    result = dualcal("run", PAPER, "--out", tmp_path / "s", *(["--dry-run"] if dry else []), *sets(*SMALL, far))
+    assert result.exit_code == 2
+    assert "0 candidates for 3 calibration constraints" in result.stderr
+    assert "the axis misses what the passive arm reaches: " in result.stderr
+    assert "move the bases 1500 mm closer together" in result.stderr
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_dry_run_without_a_stand_off_fails():
+    near = "nominal.active_base_in_passive_base.translation_mm=[600, 0, 0]"
+    result = dualcal("run", PAPER, "--dry-run", *sets(*SMALL, near))
+    assert result.exit_code == 2
+    assert "no stand-off" in result.stderr
 
 
 # -- what goes wrong -------------------------------------------------------------------------------

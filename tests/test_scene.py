@@ -128,6 +128,15 @@ def test_a_box_before_the_target_hides_what_is_behind_it(cell: Cell, offset: lis
     assert (seen_u.mean(), seen_v.mean()) == pytest.approx((u.mean(), v.mean()), abs=1.5)
 
 
+@pytest.mark.parametrize("depth", [0.012, 0.03, 0.06])
+def test_what_is_right_before_the_lens_hides_the_target_too(cell: Cell, depth: float) -> None:
+    T_E_T = cell.stand(7)
+    box = transform(np.eye(3), depth * T_E_T[:3, 3] / T_E_T[2, 3])
+    side = 0.05 * depth
+    cell.add_box(box, np.array([side, side, 0.0005]))
+    assert np.sum(hidden(cell, T_E_T) > 0.5) == pytest.approx(np.sum(within(square(side), box)), rel=0.12)
+
+
 def test_what_is_hidden_shows_what_hides_it(cell: Cell) -> None:
     T_E_T = cell.stand(7)
     box = transform(np.eye(3), 0.5 * T_E_T[:3, 3])

@@ -205,6 +205,67 @@ def test_a_goal_behind_walls_without_a_gap_is_given_up(model):
     assert ways.find(one, other) is None
 
 
+def test_retreats_are_tried_before_anything_random(model, monkeypatch):
+    """No random point, and no shortcut past a retreat, is tried here at all."""
+    monkeypatch.setattr("procedures.planning.search.ITERATIONS", 0)
+    monkeypatch.setattr("procedures.planning.search.SHORTCUTS", 0)
+    placed = replace(model.nominal, placement=Placement(model.nominal.T_P_A, *FITTED))
+    _, queries = blocked_queries(model, FITTED, 4, 1)
+    assert all(WayFinder(model, placed, []).find(*query) is None for query in queries)
+    found = [way for way in (WayFinder(model, placed, [model.home]).find(*query) for query in queries) if way]
+    assert found
+    for way in found:
+        passed = {leg.arm: leg.waypoints for leg in way}
+        assert model.home.active in passed["left"] or model.home.passive in passed["right"]
+
+
+# -- the final check in the true shapes ---------------------------------------------------------------
+
+
+def as_if_truly_close(monkeypatch, where, clearance=CLEARANCE - 0.001):
+    """As if the shape of something were not inside its capsules, at postures for which ``where`` holds."""
+    exact = ExactCell.clearance
+
+    def narrower(self, q_a, q_p, T_P_A):
+        return clearance if where(Posture.of(q_a, q_p)) else exact(self, q_a, q_p, T_P_A)
+
+    monkeypatch.setattr(ExactCell, "clearance", narrower)
+
+
+def standing(model, start, way):
+    """The postures between the legs of a way, and at its ends."""
+    postures = [start]
+    for leg in way:
+        moved = {"active" if leg.arm == model.active.name else "passive": leg.goal}
+        postures.append(replace(postures[-1], **moved))
+    return postures
+
+
+def test_a_way_that_is_too_close_in_the_true_shapes_where_an_arm_passes_is_not_gone(model, blocked, monkeypatch):
+    for start, goal in blocked:
+        stops = standing(model, start, finder(model, FITTED).find(start, goal))
+        with monkeypatch.context() as context:
+            as_if_truly_close(context, lambda posture, stops=stops: posture not in stops)
+            assert finder(model, FITTED).find(start, goal) is None
+
+
+def test_no_way_leads_to_where_the_true_shapes_are_too_close_and_that_is_said(model, monkeypatch):
+    goal = Posture.of(np.array(model.home.active) + 0.3, np.array(model.home.passive) - 0.3)
+    ways = finder(model, apart=2.0)
+    assert ways.find(model.home, goal) is not None
+    as_if_truly_close(monkeypatch, lambda posture: posture == goal)
+    assert ways.find(model.home, goal) is None
+    assert "true shapes" in ways.blocked_by(model.home, goal)
+
+
+def test_who_stands_too_close_in_the_true_shapes_may_leave_and_only_from_there(model, monkeypatch):
+    goal = Posture.of(np.array(model.home.active) + 0.3, np.array(model.home.passive) - 0.3)
+    ways = finder(model, apart=2.0)
+    as_if_truly_close(monkeypatch, lambda posture: posture != goal)
+    assert ways.find(model.home, goal) is not None
+    assert ways.find(goal, model.home) is None
+
+
 # -- determinism ----------------------------------------------------------------------------------
 
 
@@ -250,6 +311,21 @@ def test_an_arm_that_stands_too_close_may_leave_but_come_no_closer(model):
     assert not ways.clear("right", start, [(0.0, bend - 0.3, 0.2, 0.0, 0.6, 0.0)])
 
 
+def test_an_arm_that_leaves_may_not_come_back_as_close_as_it_stood_before_it_has_the_margin(model):
+    ways = finder(model)
+    start = too_close(model, ways)
+    bend = start.passive[1]
+    there_and_back = [(0.0, bend + step, 0.2, 0.0, 0.6, 0.0) for step in (0.3, 0.01)]
+    assert not ways.clear("right", start, there_and_back)
+
+
+def test_no_way_leads_from_where_the_arms_may_be_touching_for_an_allowed_error(model):
+    ways = finder(model, (0.12, float(np.deg2rad(12))))
+    start = too_close(model, finder(model))
+    assert model.geometry.between([start.active], [start.passive], Placement(model.nominal.T_P_A))[0] > 0.005
+    assert ways.find(start, model.home) is None
+
+
 def test_arms_that_stand_too_close_find_home(model):
     ways = finder(model)
     start = too_close(model, ways)
@@ -270,6 +346,21 @@ def test_an_arm_that_was_jogged_beyond_the_procedures_limits_comes_in_but_is_not
     assert ways.find(jogged, model.home) is not None
     assert ways.find(model.home, jogged) is None
     assert ways.blocked_by(model.home, jogged) == "the goal of 'right' is outside its limits"
+
+
+def test_checked_postures_keep_besides_the_clearance_what_may_be_lost_between_two_of_them(model):
+    """25 mm where no point moves further than 10 mm from one check to the next: one at 22 mm does not do."""
+    placement = Placement(model.nominal.T_P_A)
+    swing = np.array([[0.0, bend, 0.2, 0.0, 0.6, 0.0] for bend in np.linspace(0.0, -1.2, 2000)])
+    clearance = model.geometry.clearance([[0.0, -0.75, 0.2, 0.0, 0.6, 0.0]], swing, placement)
+    near, far = (
+        int(np.flatnonzero((clearance > least) & (clearance < most))[0])
+        for least, most in ((0.021, 0.024), (0.026, 0.029))
+    )
+    ways = finder(model)
+    start = Posture.of([0.0, -0.75, 0.2, 0.0, 0.6, 0.0], swing[0])
+    assert ways.clear("right", start, [swing[far]])
+    assert not ways.clear("right", start, [swing[near]])
 
 
 # -- what is said about ways ------------------------------------------------------------------------

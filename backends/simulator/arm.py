@@ -32,6 +32,7 @@ class SimulatedArm:
         self.target: Joints = self._stepper.destination(name)
         self._approach = Approach.at_rest(len(self.target))
         self._begin = self._end = world.clock.now()
+        self._settled: float | None = self._end
         self._error_before = self._error_after = world.joint_error(name, self.target)
 
     def true_positions(self, when: float) -> Array:
@@ -116,8 +117,20 @@ class SimulatedArm:
     def _next_look(self) -> float:
         with self._world.lock:
             now = self._world.clock.now()
-            later = self._stepper.next_look(self._name, now)
+            later = self._over_not_before(now)
             return now if later is None else later
+
+    def _over_not_before(self, now: float) -> float | None:
+        """When to look again whether the motion is over; None once it is.
+
+        An arm at rest has to be so by its encoders too, which may report it late.
+        """
+        later = self._stepper.next_look(self._name, now)
+        if later is not None or self._stepper.fault is not None:
+            return later
+        self._settled = now if self._settled is None else self._settled
+        reported = self._settled + self._world.time_skew
+        return reported if now < reported else None
 
     def _finish(self, motion: Motion | None) -> None:
         """End ``motion`` if it is the present one and is over; its listeners run without the lock."""
@@ -125,15 +138,15 @@ class SimulatedArm:
             now = self._world.clock.now()
             if motion is None or motion is not self._motion:
                 return
-            settled = self._stepper.next_look(self._name, now) is None
-            if not settled and now <= self._end + LONGEST_SETTLING:
+            over = self._over_not_before(now) is None
+            if not over and now <= self._end + LONGEST_SETTLING + self._world.time_skew:
                 return
             self._motion = None
             fault, stop_reason = self._stepper.fault, self._stop_reason
             final = self.state("arrival")
         if fault is not None:
-            motion.fail(fault, "open the simulator anew", Contact)
-        elif not settled:
+            motion.fail(fault, "check what the cell file says of bases, shapes and fixtures; then run anew", Contact)
+        elif not over:
             motion.fail(f"not settled {LONGEST_SETTLING:g} s after its set points came to rest")
         elif stop_reason is None:
             motion.settle(final)
@@ -145,7 +158,7 @@ class SimulatedArm:
         the one that belongs there."""
         self._error_before = self._joint_error(begin)
         self._approach = self._world.truth.approach(self._approach, stretches, end)
-        self._begin, self._end = begin, end
+        self._begin, self._end, self._settled = begin, end, None
         destination = self._stepper.destination(self._name)
         if destination != self.target:
             self.target = destination
@@ -164,4 +177,4 @@ class SimulatedArm:
 
     def _refuse_if_faulty(self, attempted: str) -> None:
         if self._stepper.fault is not None:
-            raise CommandRefused(self._name, attempted, self._stepper.fault, "open the simulator anew")
+            raise CommandRefused(self._name, attempted, self._stepper.fault, "begin a new run")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict
@@ -61,8 +62,11 @@ class SimulatorBackend(Backend):
         board, margin, intrinsics = cell.target.board, cell.target.margin, cell.camera.intrinsics
         renderer = Renderer(board, margin, intrinsics, simulation.noise.blur_px, simulation.errors)
         world = World(cell, simulation, self._clock)
-        bodies = world.stepper.scene
-        self._open = Sight(world, renderer, None if bodies is None else Scene(bodies, cell, renderer.rays))
+        with ExitStack() as if_it_fails:
+            if_it_fails.callback(world.close)
+            bodies = world.stepper.scene
+            self._open = Sight(world, renderer, None if bodies is None else Scene(bodies, cell, renderer.rays))
+            if_it_fails.pop_all()
 
     def close(self) -> None:
         opened, self._open = self._open, None

@@ -24,7 +24,7 @@ class Approach:
     """How an arm came to its rest, or is coming: what backlash and swinging links depend on.
 
     slack: (n,) rad by which each motor is ahead of its link; way: (n,) how far each joint goes in the last stretch, by
-    the one that goes farthest; end: the time in s from which on the motors rest.
+    the one that goes farthest; end: the time in s from which on its set points rest.
     """
 
     slack: Array

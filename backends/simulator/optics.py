@@ -14,6 +14,8 @@ from dualcal_hal.transforms import Array
 if TYPE_CHECKING:
     from dualcal_hal.config.image_errors import ImageErrorsConfig
 
+_OF_THE_LENS = ("focal", "principal_point", "distortion_residual")
+
 
 def true_intrinsics(intrinsics: Intrinsics, errors: ImageErrorsConfig) -> Intrinsics:
     """The camera as it is, of which the cell file says ``intrinsics``."""
@@ -35,6 +37,19 @@ def _residual_k1(intrinsics: Intrinsics, displacement: float) -> float:
     rays = undistorted(corners, intrinsics)
     per_k1 = np.sum(rays**2, axis=1) * np.linalg.norm(rays * np.diag(intrinsics.matrix)[:2], axis=1)
     return displacement / float(per_k1.max())
+
+
+def true_rays(intrinsics: Intrinsics, errors: ImageErrorsConfig) -> Array:
+    """(height, width, 2): :func:`undistorted_rays` of the camera as it is, of which the cell file says ``intrinsics``.
+
+    Raises UsageError that names the errors where it is they that bend rays too far.
+    """
+    try:
+        return undistorted_rays(true_intrinsics(intrinsics, errors))
+    except UsageError as error:
+        undistorted_rays(intrinsics)
+        named = " and ".join(f"simulation.errors.{name}" for name in _OF_THE_LENS if name in errors.model_fields_set)
+        raise UsageError(f"{named}: distortion could not be undone everywhere in the image; make it smaller") from error
 
 
 def undistorted_rays(intrinsics: Intrinsics) -> Array:

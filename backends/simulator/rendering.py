@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from backends.simulator.light import Light, smeared
 from backends.simulator.markers import pattern_of
-from backends.simulator.optics import true_intrinsics, undistorted_rays
+from backends.simulator.optics import true_intrinsics, true_rays
 from backends.simulator.pattern import Values
 from backends.simulator.scene import View
 from backends.simulator.surface import Surface
@@ -59,7 +59,7 @@ class Renderer:
         self._errors = errors
         self._light = Light(errors.lighting, intrinsics.size, (WHITE + BLACK) / 2)
         # Single precision: it moves no corner by 1e-4 px, and halves memory and traffic.
-        self.rays = undistorted_rays(self._intrinsics).astype(np.float32)
+        self.rays = true_rays(intrinsics, errors).astype(np.float32)
         self._ray_planes = cv2.split(self.rays)
         self._coarse_rays = self.rays[::_COARSE, ::_COARSE].copy()
         self._coarse_spacing = max(np.abs(np.diff(self._coarse_rays, axis=axis)).max() for axis in (0, 1))

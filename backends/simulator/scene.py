@@ -22,7 +22,7 @@ Part = tuple[int, int]
 
 SIZE = (256, 192)
 """Width and height of the reduced picture, px."""
-NEAREST, FARTHEST = 0.05, 20.0
+NEAREST, FARTHEST = 0.01, 20.0
 """What is seen lies at these depths, m: nothing of the camera's own housing, which may hold the optical centre."""
 
 SKY, FLOOR = 110, 80

@@ -7,19 +7,21 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from dualcal_hal.config.values import NotNegative, Number, Positive, Section
+from dualcal_hal.config.values import NotNegative, Number, PartsPerMillion, Positive, Section
 
 Share = Annotated[Number, Field(ge=0, le=1)]
 Percent = Annotated[Number, Field(ge=0, le=100)]
+
+_NEAREST = 0.1  # m: the blur of a target in the lens, or behind it, has no meaning
 
 
 class SquareScaleConfig(Section):
     """The pattern is printed too large, about the feature point."""
 
-    x_ppm: Number = 0.0
-    """Along the target's x, parts per million."""
-    y_ppm: Number = 0.0
-    """Along the target's y, parts per million."""
+    x_ppm: PartsPerMillion = 0.0
+    """Along the target's x, parts per million; within 100 000."""
+    y_ppm: PartsPerMillion = 0.0
+    """Along the target's y, parts per million; within 100 000."""
 
     @property
     def factors(self) -> tuple[float, float]:
@@ -42,10 +44,10 @@ class FlatnessConfig(Section):
 class FocalConfig(Section):
     """The focal lengths are longer than the cell file says."""
 
-    x_ppm: Number = 0.0
-    """fx, parts per million."""
-    y_ppm: Number = 0.0
-    """fy, parts per million."""
+    x_ppm: PartsPerMillion = 0.0
+    """fx, parts per million; within 100 000."""
+    y_ppm: PartsPerMillion = 0.0
+    """fy, parts per million; within 100 000."""
 
 
 class PrincipalPointConfig(Section):
@@ -98,7 +100,10 @@ class LightingConfig(Section):
 
 
 class DefocusConfig(Section):
-    """The lens is focused on one distance; the blur is that of the feature point, for the whole image."""
+    """The lens is focused on one distance; the blur is that of the feature point, for the whole image.
+
+    Nearer than 100 mm it grows no more.
+    """
 
     px_per_dioptre: NotNegative = 0.0
     """Sigma of the blur for each 1/m between the reciprocal distances of the target and of the focus, px m."""
@@ -107,14 +112,14 @@ class DefocusConfig(Section):
 
     def sigma(self, distance: float) -> float:
         """Sigma in px at ``distance`` m, in proportion to a thin lens's circle of confusion."""
-        return self.px_per_dioptre * abs(1.0 / distance - 1000.0 / self.focus_mm)
+        return self.px_per_dioptre * abs(1.0 / max(distance, _NEAREST) - 1000.0 / self.focus_mm)
 
 
 class MotionBlurConfig(Section):
     """The shutter stays open while things move or tremble; the frame's time is that of its opening."""
 
-    exposure_ms: NotNegative = 0.0
-    """Time of exposure, ms."""
+    exposure_ms: Annotated[Number, Field(ge=0, le=1000)] = 0.0
+    """Time of exposure, ms; at most 1000."""
 
     @property
     def exposure(self) -> float:

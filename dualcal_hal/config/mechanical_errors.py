@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from dualcal_hal.config.values import NotNegative, Number, Positive, Section
+from dualcal_hal.config.values import NotNegative, Number, PartsPerMillion, Positive, Section
 from dualcal_hal.transforms import Array
 
 
@@ -84,8 +84,8 @@ class ComplianceConfig(Section):
 class ArmScaleConfig(Section):
     """Both arms are larger than known, in all lengths of their Denavit-Hartenberg rows."""
 
-    ppm: Number = 0.0
-    """Parts per million."""
+    ppm: PartsPerMillion = 0.0
+    """Parts per million; within 100 000."""
 
     @property
     def factor(self) -> float:
@@ -114,8 +114,8 @@ class BaseDriftConfig(Section):
 class ThermalConfig(Section):
     """Both arms grow from the start of the simulation on as they warm up: 1 - exp(-t / time constant) of the end."""
 
-    growth_ppm: Number = 0.0
-    """Of all lengths in the end, parts per million."""
+    growth_ppm: PartsPerMillion = 0.0
+    """Of all lengths in the end, parts per million; within 100 000."""
     time_constant_min: Positive = 60.0
     """Minutes of simulated time."""
 
@@ -163,7 +163,10 @@ class TargetSlipConfig(TargetMountConfig):
 
 
 class SettleTimeConfig(Section):
-    """An arm's links go on swinging along its last move after its motors have stopped; encoders do not see it."""
+    """An arm's links go on swinging along its last move once its set points rest; encoders do not see it.
+
+    Motors with weight to move (the stepper bullet) settle some 0.06 s later: that much has faded by the first frame.
+    """
 
     amplitude_mrad: NotNegative = 0.0
     """Of the joint that moved farthest, as the swing begins, mrad; of the others in proportion to their way."""
@@ -173,7 +176,7 @@ class SettleTimeConfig(Section):
     """Time in which it fades to 1/e, seconds."""
 
     def swing(self, since: float) -> float:
-        """Rad of the joint that moved farthest, ``since`` s after the motors have stopped."""
+        """Rad of the joint that moved farthest, ``since`` s after its set points came to rest."""
         if since <= 0.0:
             return 0.0
         turn, fading = 2 * np.pi * self.frequency_hz * since, np.exp(-since / self.decay_s)

@@ -12,6 +12,9 @@ from dualcal_hal.config.values import NotNegative, Number, Positive, Range, Sect
 from dualcal_hal.kinematics import Chain, Row
 from dualcal_hal.transforms import Array
 
+LIMIT_MARGIN_DEG = 3.0
+"""How far a procedure stays inside the limits of each joint where the cell file does not say, degrees."""
+
 
 class DhRow(Section):
     """One joint: Rz(theta + q) Tz(d) Tx(a) Rx(alpha); with beta Rz(theta + q) Tx(a) Rx(alpha) Ry(beta)."""
@@ -69,6 +72,8 @@ class RobotConfig(Section):
     """Calibrated before; taken as true by the method."""
     limits_deg: tuple[Range, ...]
     """Lower and upper limit of each joint, degrees."""
+    limit_margin_deg: tuple[NotNegative, ...] | None = None
+    """How far a procedure stays inside the limits of each joint, for cables and hoses, degrees; where left out 3."""
     speed_deg_s: tuple[Positive, ...]
     """Highest speed of each joint, degrees per second."""
     acceleration_deg_s2: tuple[Positive, ...]
@@ -81,15 +86,13 @@ class RobotConfig(Section):
     """Standard deviation of a joint's error after arriving, which its encoder does not show, mrad."""
     repeatability_mm: NotNegative
     """The maker's repeatability, mm; only warned with."""
-    limit_margin_deg: tuple[NotNegative, ...] | None = None
-    """How far a procedure stays inside the limits of each joint, for cables and hoses, degrees; where left out 3."""
     link_radius_mm: tuple[Positive, ...] | None = None
     """Radius of the capsule about each link, mm; where left out 55 for the first three and 45 for the wrist's."""
     target_mount: TransformConfig | None = Field(default=None, validate_default=True)
     """Target in the passive flange; the passive arm's alone."""
 
     @field_validator(
-        "limits_deg", "speed_deg_s", "acceleration_deg_s2", "home_deg", "limit_margin_deg", "link_radius_mm"
+        "limits_deg", "limit_margin_deg", "speed_deg_s", "acceleration_deg_s2", "home_deg", "link_radius_mm"
     )
     @classmethod
     def _one_entry_a_joint(cls, value: tuple[Any, ...] | None, info: ValidationInfo) -> Any:
@@ -102,22 +105,17 @@ class RobotConfig(Section):
     @classmethod
     def _home_within_limits(cls, value: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
         limits = info.data.get("limits_deg", ())
-        outside = [
-            f"joint {joint}: {angle:g} is outside {lower:g} to {upper:g}"
-            for joint, (angle, (lower, upper)) in enumerate(zip(value, limits, strict=False), start=1)
-            if not lower <= angle <= upper
-        ]
+        margins = info.data.get("limit_margin_deg") or [LIMIT_MARGIN_DEG] * len(limits)
+        outside = []
+        for joint, (angle, (lower, upper), margin) in enumerate(zip(value, limits, margins, strict=False), start=1):
+            if not lower <= angle <= upper:
+                outside.append(f"joint {joint}: {angle:g} is outside {lower:g} to {upper:g}")
+            elif not lower + margin <= angle <= upper - margin:
+                outside.append(
+                    f"joint {joint}: {angle:g} is less than limit_margin_deg, {margin:g}, inside {lower:g} to {upper:g}"
+                )
         if outside:
             raise ValueError("; ".join(outside))
-        return value
-
-    @field_validator("limit_margin_deg")
-    @classmethod
-    def _margin_leaves_room(cls, value: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
-        limits, home = info.data.get("limits_deg", ()), info.data.get("home_deg", ())
-        for joint, (margin, (lower, upper), angle) in enumerate(zip(value or (), limits, home, strict=False), start=1):
-            if not lower + margin <= angle <= upper - margin:
-                raise ValueError(f"joint {joint}: home at {angle:g} is less than {margin:g} inside its limits")
         return value
 
     @field_validator("target_mount")
@@ -147,7 +145,7 @@ class RobotConfig(Section):
     @property
     def limit_margin(self) -> Array:
         """(n,) rad."""
-        return np.radians(self.limit_margin_deg or [3.0] * len(self.limits_deg))
+        return np.radians(self.limit_margin_deg or [LIMIT_MARGIN_DEG] * len(self.limits_deg))
 
     @property
     def speed(self) -> Array:

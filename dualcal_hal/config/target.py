@@ -54,7 +54,8 @@ class TargetConfig(Section):
     margin_mm: NotNegative = 10.0
     """Width of the plate beyond the outer squares, mm."""
     marker_mm: Positive | None = Field(default=None, validate_default=True)
-    """Side of a marker with its black border, mm; charuco alone."""
+    """Side of a marker with its black border, mm; charuco alone. At the farthest a bit of it (a sixth of the side with
+    a 4X4 dictionary, a ninth with a 7X7 one) must be 2 px wide in a sharp image, 4 px in one blurred by 1.5 px."""
     dictionary: Dictionary | None = Field(default=None, validate_default=True)
     """The markers' dictionary, by OpenCV's name; charuco alone."""
     legacy: bool = False

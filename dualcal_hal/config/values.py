@@ -30,6 +30,7 @@ from dualcal_hal.transforms import (
 Number = Annotated[float, Strict()]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
+PartsPerMillion = Annotated[Number, Field(ge=-1e5, le=1e5)]
 
 
 def _whole(value: Any) -> Any:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from dualcal_hal.geometry.capsules import Capsules
 from dualcal_hal.geometry.distance import length, segment_distance
 from dualcal_hal.geometry.solids import Fixture
-from dualcal_hal.kinematics import Chain
+from dualcal_hal.kinematics import Chain, random_joints
 from dualcal_hal.transforms import Array
 
 LARGEST_MOTION = 0.010
@@ -20,6 +20,10 @@ LARGEST_MOTION = 0.010
 BETWEEN_SAMPLES = LARGEST_MOTION / 2
 """What clearance may fall short (m) between two checks: every point is within this of its place at one of them."""
 
+LEAST_APART = 0.008
+"""m; parts of one arm that no posture brings so far apart are not held against each other."""
+
+_POSTURES = 400
 _COARSE_STEP = 0.05  # rad; chords of it differ from their arcs by less than a thousandth
 _ARC_RESERVE = 0.99
 
@@ -27,13 +31,20 @@ _ARC_RESERVE = 0.99
 class ArmBody:
     """An arm with what it carries and what stands about its base.
 
-    links, tool: its capsules; floor: height in its base, m, or None; fixtures: in its base; pairs: (k, 2) numbers of
-    capsules that can meet; above_floor, moving: numbers of those held against the floor and the other base's fixtures,
-    and against its own base's.
+    links, tool: its capsules; floor: height in its base, m, or None; fixtures: in its base; clearance: m, what shall be
+    kept. pairs: (k, 2) numbers of capsules that can meet; relief: (k,) m, added to the distance of pairs that are built
+    too close together for the clearance; above_floor, moving: numbers of those held against the floor and the other
+    base's fixtures, and against its own base's.
     """
 
     def __init__(
-        self, chain: Chain, links: Capsules, tool: Capsules, floor: float | None, fixtures: Sequence[Fixture] = ()
+        self,
+        chain: Chain,
+        links: Capsules,
+        tool: Capsules,
+        floor: float | None,
+        fixtures: Sequence[Fixture] = (),
+        clearance: float = 0.0,
     ) -> None:
         self.chain = chain
         self.links, self.tool = links, tool
@@ -44,7 +55,7 @@ class ArmBody:
         # against a floor or what may carry both arms, the column not against anything of its own base.
         self.above_floor = np.flatnonzero(self.capsules.frame >= 2)
         self.moving = np.flatnonzero(self.capsules.frame >= 1)
-        self.pairs = _own_pairs(links, tool)
+        self.pairs, self.relief = self._held_apart(clearance)
 
     def segments(self, q: ArrayLike) -> Array:
         """Joint angles (k, n) to the capsules' ends in the arm's base, (k, c, 2, 3)."""
@@ -55,7 +66,7 @@ class ArmBody:
     def own_clearance(self, q: ArrayLike) -> Array:
         """Least distance (k,) in m to the floor, to the fixtures of its base, and between parts that may meet.
 
-        Infinite if there is nothing to meet.
+        Parts have their relief. Infinite if there is nothing to meet.
         """
         q = np.atleast_2d(np.asarray(q, dtype=float))
         segments, radius = self.segments(q), self.capsules.radius
@@ -64,9 +75,7 @@ class ArmBody:
             heights = segments[..., 2][:, self.above_floor].min(axis=2) - radius[self.above_floor]
             least = np.minimum(least, heights.min(axis=1) - self.floor)
         if len(self.pairs):
-            first, second = self.pairs.T
-            distance = segment_distance(segments[:, first], segments[:, second]) - radius[first] - radius[second]
-            least = np.minimum(least, distance.min(axis=1))
+            least = np.minimum(least, (self._own_distances(segments, self.pairs) + self.relief).min(axis=1))
         for fixture in self.fixtures:
             distance = fixture.separation(segments[:, self.moving]) - radius[self.moving]
             least = np.minimum(least, distance.min(axis=1))
@@ -82,6 +91,38 @@ class ArmBody:
         straight = [self._straight(*ends, largest_motion)[1:] for ends in itertools.pairwise(points)]
         return np.concatenate([points[:1], *straight])
 
+    def _held_apart(self, clearance: float) -> tuple[NDArray[np.int64], Array]:
+        """Pairs (k, 2) of capsules that are held against each other, and what is added to the distance of each (k,).
+
+        Neighbours along the chain always touch, and so do parts with only a short link between them: parts that no
+        posture brings apart say nothing about a posture. Others can be brought apart, but not by the clearance: these
+        need only half of the distance that is possible. What the arm carries counts as one part, the end of the chain.
+        """
+        count = len(self.links)
+        pairs = np.array(
+            [(i, j) for i in range(count) for j in range(i + 2, count + len(self.tool)) if min(j, count) >= i + 2],
+            dtype=np.int64,
+        ).reshape(-1, 2)
+        if len(pairs) == 0:
+            return pairs, np.zeros(0)
+        q = random_joints(np.random.default_rng(0), _POSTURES, np.full(self.chain.joints, -np.pi), np.pi)
+        distance = self._own_distances(self.segments(q), pairs)
+        part = np.minimum(pairs[:, 1], count)
+        possible = np.empty(len(pairs))
+        for i, j in set(zip(pairs[:, 0].tolist(), part.tolist(), strict=True)):
+            same = (pairs[:, 0] == i) & (part == j)
+            possible[same] = distance[:, same].min(axis=1).max()
+        held = possible >= LEAST_APART
+        needed = np.minimum(clearance + BETWEEN_SAMPLES, possible[held] / 2)
+        return np.asarray(pairs[held]), np.asarray(clearance + BETWEEN_SAMPLES - needed)
+
+    def _own_distances(self, segments: Array, pairs: NDArray[np.int64]) -> Array:
+        """Distances (k, p) in m of the pairs (p, 2) with the capsules' ends at (k, c, 2, 3)."""
+        first, second = pairs.T
+        radius = self.capsules.radius
+        distance = segment_distance(segments[:, first], segments[:, second])
+        return np.asarray(distance - radius[first] - radius[second])
+
     def _straight(self, start: Array, end: Array, largest_motion: float) -> Array:
         fractions = np.linspace(0.0, 1.0, 2 + int(np.max(np.abs(end - start)) / _COARSE_STEP))
         aim = largest_motion
@@ -94,22 +135,3 @@ class ArmBody:
             travelled = np.concatenate([[0.0], np.cumsum(moved)])
             even = np.linspace(0.0, travelled[-1], 1 + int(np.ceil(travelled[-1] / aim)))
             fractions = np.interp(even, travelled, fractions)
-
-
-def _own_pairs(links: Capsules, tool: Capsules) -> NDArray[np.int64]:
-    """Pairs (k, 2) of an arm's capsules that can meet: those with more between them than their own radii fill.
-
-    Neighbours along the chain always touch; so do parts with only a short link between them. The tool counts as
-    the end of the chain.
-    """
-    lengths = length(links.ends[:, 1] - links.ends[:, 0])
-    count = len(lengths)
-    pairs = []
-    for i in range(count):
-        for j in range(i + 2, count + len(tool)):
-            last = min(j, count)
-            radius_j = links.radius[j] if j < count else tool.radius[j - count]
-            between = lengths[i + 1 : last].sum()
-            if between > 1.25 * (links.radius[i] + radius_j):
-                pairs.append((i, j))
-    return np.array(pairs, dtype=np.int64).reshape(-1, 2)

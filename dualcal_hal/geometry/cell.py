@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,15 +27,16 @@ class CellGeometry:
     passive: ArmBody
 
     @staticmethod
-    def of(cell: CellConfig) -> CellGeometry:
+    def of(cell: CellConfig, T_H_E: Array | None = None, camera_error: float = 0.0) -> CellGeometry:
         """The arms of a cell file with camera and plate.
 
-        The camera's housing stands where the nominal hand-eye transform says: its error, a centimetre and some
-        degrees, is inside the clearance that is kept.
+        The camera's housing stands where ``T_H_E`` (4, 4) says, or the nominal one, and is thicker by ``camera_error``
+        (m) all around.
         """
-        active, passive = cell.active, cell.passive
-        body = cell.camera.body_radius, cell.camera.body_length
-        housing = camera_capsule(active.chain.joints, cell.nominal.T_H_E, *body)
+        active, passive, clearance = cell.active, cell.passive, cell.procedure.clearance
+        T_H_E = cell.nominal.T_H_E if T_H_E is None else T_H_E
+        housing = camera_capsule(active.chain.joints, T_H_E, cell.camera.body_radius, cell.camera.body_length)
+        housing = replace(housing, radius=housing.radius + camera_error)
         plate = plate_capsules(passive.chain.joints, passive.target_mount_transform, cell.target.plate_outline)
         about = {
             base: [Fixture(name, f.solid, f.T) for name, f in cell.fixtures.items() if f.base == base]
@@ -44,8 +45,8 @@ class CellGeometry:
         links_a = link_capsules(active.chain, active.link_radius)
         links_p = link_capsules(passive.chain, passive.link_radius)
         return CellGeometry(
-            ArmBody(active.chain, links_a, housing, cell.floor, about["active_base"]),
-            ArmBody(passive.chain, links_p, plate, cell.floor, about["passive_base"]),
+            ArmBody(active.chain, links_a, housing, cell.floor, about["active_base"], clearance),
+            ArmBody(passive.chain, links_p, plate, cell.floor, about["passive_base"], clearance),
         )
 
     def between(self, q_a: ArrayLike, q_p: ArrayLike, placement: Placement) -> Array:

@@ -58,7 +58,8 @@ class _ExactArm:
         self._fixtures = [_Part(0, _shape(fixture.solid), fixture.T) for fixture in body.fixtures]
         floor = [] if body.floor is None else [transform(np.eye(3), [0.0, 0.0, body.floor])]
         self._floor = [_Part(0, _half_space(), T) for T in floor]
-        self.pairs = {(int(i), min(int(j), len(body.links))) for i, j in body.pairs}
+        parts = [(int(i), min(int(j), len(body.links))) for i, j in body.pairs]
+        self.relief = dict(zip(parts, body.relief.tolist(), strict=True))
 
     def parts(self, q: ArrayLike, T_base: Array) -> list[_Placed]:
         """The arm at joint angles (n,) with its base at ``T_base`` (4, 4)."""
@@ -83,34 +84,35 @@ class ExactCell:
     _passive: _ExactArm
 
     @staticmethod
-    def of(cell: CellConfig) -> ExactCell:
-        """The arms of a cell file."""
-        geometry = CellGeometry.of(cell)
+    def of(cell: CellConfig, T_H_E: Array | None = None) -> ExactCell:
+        """The arms of a cell file, the camera at ``T_H_E`` (4, 4) or where the nominal one says."""
+        T_H_E = cell.nominal.T_H_E if T_H_E is None else T_H_E
+        geometry = CellGeometry.of(cell, T_H_E)
         camera, T_E_box = camera_box(cell.camera.body_radius, cell.camera.body_length)
         plate, T_T_box = plate_box(cell.target.plate_outline)
         return ExactCell(
-            _ExactArm(geometry.active, camera, cell.nominal.T_H_E @ T_E_box),
+            _ExactArm(geometry.active, camera, T_H_E @ T_E_box),
             _ExactArm(geometry.passive, plate, cell.passive.target_mount_transform @ T_T_box),
         )
 
     def clearance(self, q_a: ArrayLike, q_p: ArrayLike, T_P_A: Array) -> float:
         """Least of all distances in m at joint angles (n,) with the bases at ``T_P_A``; below zero where two overlap.
 
-        A part that is wholly inside a mesh is as far from it as from its surface.
+        A part that is wholly inside a mesh is as far from it as from its surface. Parts of one arm have their relief.
         """
-        return min((a.distance(b) for a, b in self._neighbours(q_a, q_p, T_P_A)), default=np.inf)
+        return min((a.distance(b) + relief for a, b, relief in self._neighbours(q_a, q_p, T_P_A)), default=np.inf)
 
-    def _neighbours(self, q_a: ArrayLike, q_p: ArrayLike, T_P_A: Array) -> Iterator[tuple[_Placed, _Placed]]:
-        """All that must not come close to each other."""
+    def _neighbours(self, q_a: ArrayLike, q_p: ArrayLike, T_P_A: Array) -> Iterator[tuple[_Placed, _Placed, float]]:
+        """All that must not come close to each other, and the relief."""
         active, passive = (self._active, T_P_A), (self._passive, np.eye(4))
         parts_a, parts_p = self._active.parts(q_a, T_P_A), self._passive.parts(q_p, np.eye(4))
-        yield from itertools.product(parts_a, parts_p)
+        yield from itertools.product(parts_a, parts_p, [0.0])
         for parts, (arm, T_base), (other, T_other) in ((parts_a, active, passive), (parts_p, passive, active)):
             moving = [part for part in parts if part.frame >= 1]
             above_floor = [part for part in parts if part.frame >= 2]
-            yield from ((parts[i], parts[j]) for i, j in arm.pairs)
-            yield from itertools.product(moving, arm.fixtures(T_base))
-            yield from itertools.product(above_floor, [*arm.floor(T_base), *other.fixtures(T_other)])
+            yield from ((parts[i], parts[j], relief) for (i, j), relief in arm.relief.items())
+            yield from itertools.product(moving, arm.fixtures(T_base), [0.0])
+            yield from itertools.product(above_floor, [*arm.floor(T_base), *other.fixtures(T_other)], [0.0])
 
 
 def _placed(parts: list[_Part], frames: Array) -> list[_Placed]:

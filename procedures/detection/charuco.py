@@ -29,6 +29,8 @@ from procedures.detection.saddle import LARGEST_WINDOW, SMALLEST_WINDOW, reach
 
 FEWEST_CORNERS = 4
 """Corners that make a pose of the board."""
+SMALLEST_BIT = 4.0
+"""px of a marker's bit below which a blur of 1.5 px hides some; in sharp images 2 px are enough."""
 _NEAREST = 4  # markers from which a corner's place is told; a lens bends the rest of the plane too much
 _ADJACENT = 1.0  # squares from a marker's middle, within which a corner counts as told by it
 _MARKER_OFF = 0.1  # squares by which a marker's corner may be off the plane of the others
@@ -49,8 +51,8 @@ class CharucoFinder:
         self._middles = board.marker_squares - 0.5
         self._marker_corners = self._middles[:, None] + ends
         self._gap = 0.5 - half
-        bits = dictionary.markerSize + 2
-        self._to_bits = self._gap + board.marker / board.square / bits
+        self._bits = dictionary.markerSize + 2
+        self._to_bits = self._gap + board.marker / board.square / self._bits
         self._sign = 1.0 if board.white_first else -1.0
 
     def searches(self, size: tuple[int, int], near: Region | None, step: float) -> Iterator[tuple[Region, int]]:
@@ -68,7 +70,8 @@ class CharucoFinder:
         usable = np.where(inside(told, size, reach(half))[:, None], told, np.nan)
         corners, weakest = self._checked(image, self._refined(image, usable, half))
         if not self._are_enough(corners):
-            raise _too_few(image, told, _count(usable) < _count(told), _count(corners))
+            bit = float(np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).min()) / self._bits
+            raise _too_few(image, told, _count(usable) < _count(told), _count(corners), bit)
         grid = self._as_grid(corners)
         blur = checked_blur(image, grid, min(0.4, self._gap) * spacing(grid))
         return Detection(corners, True, blur, weakest, self._board.feature)
@@ -153,13 +156,20 @@ def _count(corners: Array) -> int:
     return int(np.isfinite(corners[:, 0]).sum())
 
 
-def _too_few(image: Image, told: Array, cut: bool, seen: int) -> Refused:
+def _too_few(image: Image, told: Array, cut: bool, seen: int, bit: float) -> Refused:
     """Why fewer corners than are needed were found, although markers were.
 
-    ``cut``: whether some of them are too near to the image's edge, or beyond it.
+    ``cut``: whether some of them are too near to the image's edge, or beyond it; ``bit``: width of the least of the
+    markers' bits, px.
     """
     said = f"{seen} corners beside the markers that were found, {FEWEST_CORNERS} in two rows are needed"
     if cut:
         return Refused(Miss.AT_BORDER, f"{said}; bring the target nearer to the middle of the image")
     raise_light_problem(around(image, told[np.isfinite(told[:, 0])], 5.0))
+    if bit < SMALLEST_BIT:
+        return Refused(
+            Miss.NOT_FOUND,
+            f"{said}; markers too small or image too noisy: a bit is {bit:.1f} px wide, below {SMALLEST_BIT:g} px blur"
+            " and noise hide some; go nearer, focus or print larger markers",
+        )
     return Refused(Miss.OCCLUDED, f"{said}; look what is in front of the rest")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +13,9 @@ from dualcal_hal.transforms import Array, smallest_rotation, transform
 from procedures.planning.belief import Belief
 from procedures.planning.model import ArmModel, CellModel
 
-_MOVES = (-0.2, -0.1, 0.1, 0.2)  # of the distance between the bases
+_MOVES = (-0.1, 0.1, -0.2, 0.2)  # of the distance between the bases
+_FAR_MOVES = (-0.35, 0.35, -0.5, 0.5, -0.65, 1.0, -0.8, 2.0)  # where nothing smaller helps
+_FREE_JOINTS = 6  # that an arm needs to hold what it carries at any pose
 _TILT = np.deg2rad(15.0)
 _LARGEST_TILT = np.deg2rad(75.0)
 _WIDER = (2 / 3, 4 / 3)
@@ -30,21 +33,33 @@ class _Change:
 
 
 def advice(model: CellModel, belief: Belief, success: Success) -> str:
-    """A sentence with the one change after which a cell does best, or that none of those tried helps."""
-    best, words = success(model, belief), ""
-    for change in _changes(model, belief):
-        found = success(change.model, change.belief)
-        if found > best:
-            best, words = found, change.words
+    """A sentence with the one change after which a cell does best, or that none of those tried helps.
+
+    The bases are moved far only where no other change helps, and then no farther than does some good.
+    """
+    for arm in (model.active, model.passive):
+        if arm.chain.joints < _FREE_JOINTS:
+            return (
+                f"What would help most: an arm of {_FREE_JOINTS} joints in place of '{arm.name}', whose "
+                f"{arm.chain.joints} cannot hold what it carries at any place in any direction"
+            )
+    now = success(model, belief)
+    tried = [(success(change.model, change.belief), change.words) for change in _changes(model, belief)]
+    most, words = max(tried, key=lambda found: found[0])
+    if most <= now:
+        far = (change for change in _moves(model, belief, _FAR_MOVES) if success(change.model, change.belief) > now)
+        words = next((change.words for change in far), "")
     return f"What would help most: {words}" if words else "No single change of those tried would help"
+
+
+def counted(refused: Counter[str]) -> str:
+    """How many of what was tried failed which condition, the most first."""
+    return "Refused: " + "; ".join(f"{what}: {count}" for what, count in refused.most_common() if count)
 
 
 def _changes(model: CellModel, belief: Belief) -> Iterator[_Change]:
     """The smaller changes first: of two that help as much the first is named."""
-    apart = float(np.linalg.norm(belief.T_P_A[:3, 3]))
-    for move in sorted(_MOVES, key=abs):
-        words = f"move the bases {abs(move) * apart * 1e3:.0f} mm {'closer together' if move < 0 else 'farther apart'}"
-        yield _Change(words, model, _moved(belief, 1 + move))
+    yield from _moves(model, belief, _MOVES)
     low, high = model.distance[0] * _WIDER[0], model.distance[1] * _WIDER[1]
     words = f"widen procedure.distance_mm to [{low * 1e3:.0f}, {high * 1e3:.0f}]"
     yield _Change(words, model.but(distance=(low, high)), belief)
@@ -68,6 +83,13 @@ def _changes(model: CellModel, belief: Belief) -> Iterator[_Change]:
         model,
         replace(belief, T_H_E=_along_flange(belief.T_H_E)),
     )
+
+
+def _moves(model: CellModel, belief: Belief, moves: Iterable[float]) -> Iterator[_Change]:
+    apart = float(np.linalg.norm(belief.T_P_A[:3, 3]))
+    for move in moves:
+        words = f"move the bases {abs(move) * apart * 1e3:.0f} mm {'closer together' if move < 0 else 'farther apart'}"
+        yield _Change(words, model, _moved(belief, 1 + move))
 
 
 def _moved(belief: Belief, factor: float) -> Belief:

@@ -85,7 +85,7 @@ class CandidateSource:
         for distance in (self._model.distance[1], self._model.distance[0]):
             looked_at = np.hstack([camera + distance * axis, -_NORMAL_WEIGHT * axis])
             nearest = np.full(len(q), np.inf)
-            nearest[served] = self._library.tree.query(looked_at[served])[0]
+            nearest[served] = self._library.tree.query(looked_at[served], distance_upper_bound=_NEAR)[0]
             served &= nearest < _NEAR
         self.refused["the axis misses what the passive arm reaches"] += int(np.sum(~served))
         q = q[served]

@@ -88,10 +88,12 @@ def _worth(have: Knowledge, left: Sequence[Knowledge]) -> Array:
 
 def _width(have: Knowledge, left: Sequence[Knowledge]) -> Array:
     """The same of the sum of z z^T over the axes."""
-    axes = np.concatenate([one.axes for one in left])
-    return np.asarray(
-        np.linalg.slogdet(have.axes.T @ have.axes + axes[:, :, None] * axes[:, None] + _PRIOR * np.eye(3))[1]
-    )
+    return np.asarray(np.linalg.slogdet(_outer(have, left) + _PRIOR * np.eye(3))[1])
+
+
+def _outer(have: Knowledge, left: Sequence[Knowledge]) -> Array:
+    """Sums of z z^T over the axes with one more, (k, 3, 3)."""
+    return np.asarray(have.axes.T @ have.axes + np.stack([one.axes.T @ one.axes for one in left]))
 
 
 def _greedy(
@@ -124,10 +126,10 @@ def _best_addition(pool: Sequence[Knowledge], chosen: Sequence[int], known: Know
     worth = _worth(have, [pool[i] for i in left])
     if not well_spread:
         return left[int(np.argmax(worth))]
-    with_one = [Knowledge.together([have, pool[i]]) for i in left]
-    nearness = np.array([min(1.0, k.spread / LEAST_SPREAD) for k in with_one])
+    spread = np.linalg.eigvalsh(_outer(have, [pool[i] for i in left]))[:, 0] / (len(have.axes) + 1)
+    nearness = np.minimum(1.0, spread / LEAST_SPREAD)
     if have.turn < LEAST_TURN:  # one more never takes a turn away
-        nearness += [min(1.0, k.turn / LEAST_TURN) for k in with_one]
+        nearness += [min(1.0, Knowledge.together([have, pool[i]]).turn / LEAST_TURN) for i in left]
     return left[int(np.lexsort((worth, nearness))[-1])]
 
 

@@ -8,6 +8,7 @@ transforms follow well enough (about 2 mm and 0.1 deg after five) to plan with a
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -18,7 +19,7 @@ from dualcal_hal.geometry import BETWEEN_SAMPLES
 from dualcal_hal.kinematics import random_joints
 from dualcal_hal.robot import Joints
 from dualcal_hal.transforms import Array, Mask, inverse, rotation_from_vector, smallest_rotation, transform
-from procedures.planning.advice import advice
+from procedures.planning.advice import advice, counted
 from procedures.planning.belief import Belief
 from procedures.planning.model import ArmModel, CellModel, Posture
 from procedures.planning.sight import in_sight
@@ -47,6 +48,9 @@ CAMERA_LEAN = np.deg2rad(6.0)
 """The camera looks past the board's centre by this much (rad), in another direction in each look."""
 
 _GOOD_DISTANCE = 0.65  # m between camera and board
+_TOO_CLOSE = "an arm is too close to the other, itself or what stands about it"
+_NOT_IN_VIEW = "the target is not wholly in view"
+_HIDDEN = "an arm or a fixture hides the target"
 _LEAST_APART = 1e-3  # m between the bases on the level
 _SEARCH_RINGS = np.deg2rad([12.0, 20.0])
 _CAMERA_ROLLS = np.deg2rad([40.0, 25.0, 12.0, 60.0])
@@ -124,13 +128,20 @@ def _require_fit(model: CellModel, belief: Belief, ways: WayFinder, posture: Pos
 
 def _stand_offs(model: CellModel, belief: Belief, ways: WayFinder, seed: int) -> list[Posture]:
     """Postures in which both face each other and all is clear, best first; NoPlan if there is none."""
-    pairs = _facing_pairs(model, belief, seed)
+    for other in (inverse(belief.T_P_A), belief.T_P_A):
+        if np.linalg.norm(other[:2, 3]) < _LEAST_APART:
+            raise NoPlan(
+                "no stand-off: the bases stand above each other, there is no direction in which they face; move one "
+                "of them sideways, or give procedure.stand_off"
+            )
+    refused: Counter[str] = Counter()
+    pairs = _facing_pairs(model, belief, seed, refused)
     if not pairs:
-        help_ = advice(model, belief, lambda other, belief: len(_facing_pairs(other, belief, seed)))
+        help_ = advice(model, belief, lambda other, belief: len(_facing_pairs(other, belief, seed, Counter())))
         raise NoPlan(
             "no stand-off: there is no posture in which camera and target face each other in front of their own bases, "
             "within the limits and clear for every error of the bases that nominal.uncertainty allows. "
-            f"{help_}; or give procedure.stand_off"
+            f"{counted(refused)}. {help_}; or give procedure.stand_off"
         )
     compared = pairs[:_PAIRS_COMPARED]
     return sorted(compared, key=lambda posture: -_looks_possible(model, belief, ways, posture))
@@ -143,19 +154,24 @@ def _looks_possible(model: CellModel, belief: Belief, ways: WayFinder, stand_off
     return tilts + _TILTS_PER_LOOK * sum(look is not None for look in looks)
 
 
-def look_postures(model: CellModel, belief: Belief, ways: WayFinder, at: Posture, number: int) -> Iterator[Posture]:
+def look_postures(
+    model: CellModel, belief: Belief, ways: WayFinder, at: Posture, number: int, refused: Counter[str] | None = None
+) -> Iterator[Posture]:
     """Postures for look ``number``, the preferred first, by wrist moves from the stand-off ``at``.
+
+    Counts in ``refused`` those that failed a condition.
 
     Look 0 is the stand-off itself and, should the board not be seen there, the camera tilted about its own lens in
     rings. Later ones tilt the board about its own centre, point the camera at it as now believed, and roll it.
     """
+    refused = Counter() if refused is None else refused
     aimed = model.camera_in_passive(at.active, belief)
     T_P_T = model.target_in_passive(at.passive)
     if number == 0:
         yield at
         tilts = itertools.product(_SEARCH_RINGS, np.arange(8) * np.pi / 4)
         cameras = np.array([_turned(aimed, _about(azimuth, angle)) for angle, azimuth in tilts])
-        yield from _clear_postures(model, belief, ways, at, cameras, np.tile(T_P_T, (len(cameras), 1, 1)))
+        yield from _clear_postures(model, belief, ways, at, cameras, np.tile(T_P_T, (len(cameras), 1, 1)), refused)
         return
     aimed = _aimed(aimed, T_P_T[:3, 3])
     azimuth = np.pi / 4 + (number - 1) * np.pi / 2
@@ -164,13 +180,21 @@ def look_postures(model: CellModel, belief: Belief, ways: WayFinder, at: Posture
     cameras = np.array([_turned(aimed, lean @ rotation_from_vector([0.0, 0.0, roll])) for roll in rolls])
     angle = BOARD_TILT if number <= 4 else STEEPER_TILT
     boards = np.array([_tilted(T_P_T, T_P_E, azimuth, angle) for T_P_E in cameras])
-    for posture in _clear_postures(model, belief, ways, at, cameras, boards):
+    for posture in _clear_postures(model, belief, ways, at, cameras, boards, refused):
         if model.in_view(_T_E_T(model, belief, posture)[None])[0]:
             yield posture
+        else:
+            refused[_NOT_IN_VIEW] += 1
 
 
 def _clear_postures(
-    model: CellModel, belief: Belief, ways: WayFinder, near: Posture, cameras: Array, boards: Array
+    model: CellModel,
+    belief: Belief,
+    ways: WayFinder,
+    near: Posture,
+    cameras: Array,
+    boards: Array,
+    refused: Counter[str],
 ) -> list[Posture]:
     """Postures with camera and board at poses in P (k, 4, 4): those reached, clear and in sight."""
     a, p = model.active, model.passive
@@ -180,11 +204,17 @@ def _clear_postures(
         arm.chain.inverse(flange, start, arm.lower, arm.upper)
         for arm, flange, start in zip((a, p), flanges, starts, strict=True)
     )
-    clear = reached_a & reached_p
-    if np.any(clear):
-        clear[clear] = ways.geometry.clearance(q_a[clear], q_p[clear], belief.placement) >= ways.margin
-        clear[clear] = in_sight(model, q_a[clear], q_p[clear], belief)
-    return [Posture.of(q_a[k], q_p[k]) for k in np.flatnonzero(clear)]
+    for arm, reached in ((a, reached_a), (p, reached_p)):
+        refused[f"'{arm.name}' does not get there"] += int(np.sum(~reached))
+    which = np.flatnonzero(reached_a & reached_p)
+    if len(which) == 0:
+        return []
+    clear = ways.geometry.clearance(q_a[which], q_p[which], belief.placement) >= ways.margin
+    refused[_TOO_CLOSE] += int(np.sum(~clear))
+    which = which[clear]
+    unhidden = in_sight(model, q_a[which], q_p[which], belief)
+    refused[_HIDDEN] += int(np.sum(~unhidden))
+    return [Posture.of(q_a[k], q_p[k]) for k in which[unhidden]]
 
 
 def _between(ways: WayFinder, belief: Belief, posture: Posture) -> float:
@@ -207,12 +237,12 @@ def _tilted(T_P_T: Array, T_P_E: Array, azimuth: float, angle: float) -> Array:
     return transform(smallest_rotation(T_P_T[:3, 2], normal) @ T_P_T[:3, :3], T_P_T[:3, 3])
 
 
-def _facing_postures(arm: ArmModel, other: Array, T_tool_flange: Array, rng: np.random.Generator) -> Array:
+def _facing_postures(
+    arm: ArmModel, other: Array, T_tool_flange: Array, rng: np.random.Generator, refused: Counter[str]
+) -> Array:
     """Joint angles (k, n) that hold the tool in front of the arm's base, its z axis towards the ``other`` base (3,)."""
     up = np.array([0.0, 0.0, 1.0])
     apart = float(np.linalg.norm(other[:2]))
-    if apart < _LEAST_APART:
-        raise NoPlan("no stand-off: the bases stand above each other, there is no direction in which they face")
     toward = np.array([*other[:2] / apart, 0.0])
     middle = np.clip((apart - _GOOD_DISTANCE) / 2, _LEAST_FORWARD, _MOST_FORWARD)
     facing = np.stack([np.cross(-up, toward), -up, toward], axis=1)
@@ -225,20 +255,26 @@ def _facing_postures(arm: ArmModel, other: Array, T_tool_flange: Array, rng: np.
         [random_joints(rng, len(goals) * (_STARTS - 1), arm.lower, arm.upper), np.tile(arm.home, (len(goals), 1))]
     )
     q, reached = arm.chain.inverse(np.tile(goals, (_STARTS, 1, 1)), starts, arm.lower, arm.upper)
+    refused[f"'{arm.name}' does not get there"] += int(np.sum(~reached))
     q = arm.nearest_turn(q[reached], arm.home)
     _, different = np.unique(np.round(q, 3), axis=0, return_index=True)
     return np.asarray(q[np.sort(different)])
 
 
-def _facing_pairs(model: CellModel, belief: Belief, seed: int) -> list[Posture]:
-    """Postures that are clear of everything, at a good distance, short of travel and with room at limits come first."""
+def _facing_pairs(model: CellModel, belief: Belief, seed: int, refused: Counter[str]) -> list[Posture]:
+    """Postures that are clear of everything, at a good distance, short of travel and with room at limits come first.
+
+    Counts in ``refused`` those that failed a condition.
+    """
     rng = np.random.default_rng([seed, 1])
-    q_a = _facing_postures(model.active, inverse(belief.T_P_A)[:3, 3], inverse(belief.T_H_E), rng)
-    q_p = _facing_postures(model.passive, belief.T_P_A[:3, 3], inverse(model.T_F_T), rng)
+    q_a = _facing_postures(model.active, inverse(belief.T_P_A)[:3, 3], inverse(belief.T_H_E), rng, refused)
+    q_p = _facing_postures(model.passive, belief.T_P_A[:3, 3], inverse(model.T_F_T), rng, refused)
     if not (len(q_a) and len(q_p)):
         return []
     geometry, margin = model.geometry, model.margin + BETWEEN_SAMPLES
     own_a, own_p = geometry.active.own_clearance(q_a), geometry.passive.own_clearance(q_p)
+    for arm, own in ((model.active, own_a), (model.passive, own_p)):
+        refused[f"'{arm.name}' is too close to itself, the floor or a fixture"] += int(np.sum(own < margin))
     merit_a = _ease(model.active, q_a) + np.minimum(own_a, 0.1)
     merit_p = _ease(model.passive, q_p) + np.minimum(own_p, 0.1)
     pairs = list(itertools.product(_best(merit_a, own_a >= margin), _best(merit_p, own_p >= margin)))
@@ -249,8 +285,12 @@ def _facing_pairs(model: CellModel, belief: Belief, seed: int) -> list[Posture]:
     T_E_T = inverse(model.camera_in_passive(q_a[first], belief)) @ model.target_in_passive(q_p[second])
     merit = merit_a[first] + merit_p[second] + 4 * np.minimum(between, STAND_OFF_CLEARANCE)
     merit = merit - np.abs(T_E_T[:, 2, 3] - _GOOD_DISTANCE)
-    fit = model.in_view(T_E_T) & (between >= margin)
+    seen, clear = model.in_view(T_E_T), between >= margin
+    refused[_NOT_IN_VIEW] += int(np.sum(~seen))
+    refused["the arms are too close to each other"] += int(np.sum(seen & ~clear))
+    fit = seen & clear
     fit[fit] = in_sight(model, q_a[first[fit]], q_p[second[fit]], belief)
+    refused[_HIDDEN] += int(np.sum(seen & clear & ~fit))
     order = _best(merit, fit)
     return [Posture.of(q_a[first[k]], q_p[second[k]]) for k in order]
 

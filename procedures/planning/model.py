@@ -21,6 +21,10 @@ from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.estimation.projection import project
 from procedures.planning.belief import Belief
 
+CAMERA_ERROR = 0.015
+"""m by which the camera's housing may stand off where the nominal hand-eye transform says: a centimetre, and six
+degrees about the lens."""
+
 IMAGE_MARGIN = 20.0
 """The whole target stays this far (px) inside the image."""
 
@@ -124,14 +128,25 @@ class CellModel:
         given = cell.procedure.stand_off
         self.stand_off = None if given is None else Posture.of(given.active, given.passive)
         self.nominal = Belief.nominal(cell.nominal)
-        self.geometry = CellGeometry.of(cell)
+        # Without looks the nominal transforms are all there is, and taken as exact.
+        camera_error = CAMERA_ERROR if cell.procedure.first_looks else 0.0
+        self.geometry = CellGeometry.of(cell, camera_error=camera_error)
+        self._T_H_E = self.nominal.T_H_E
         # The plate may not leave the image either: its margin helps nobody but the eye that looks for the corners.
         self._in_view = np.concatenate([self.board.corners, self.board.outline])
 
     @cached_property
     def exact(self) -> ExactCell:
         """The cell in its true shapes, slow: for the final check."""
-        return ExactCell.of(self._cell)
+        return ExactCell.of(self._cell, self._T_H_E)
+
+    def believing(self, belief: Belief) -> Self:
+        """The same cell with the camera's housing where a belief from enough looks says."""
+        if belief.placement is self.nominal.placement:
+            return self
+        other = self.but(geometry=CellGeometry.of(self._cell, belief.T_H_E), _T_H_E=belief.T_H_E)
+        vars(other).pop("exact", None)
+        return other
 
     def but(self, **changes: object) -> Self:
         """The same cell with some of its attributes changed; its shapes stay."""

@@ -68,18 +68,23 @@ class Mover:
     def free_samples(self, samples: Array, point: Array) -> int:
         """How many of the samples (k, n) of a move can be passed from its first on.
 
-        An arm that stands closer than the margin, because the belief has changed, may leave but come no closer.
+        An arm that stands closer than the margin may leave: its clearance may only grow until it has the margin. Not
+        where the bases may be so wrong that it touches the other arm: then every way could lead deeper into it.
         """
         free = len(samples)
-        allowed: Array | None = None
+        if not self.may_leave(point):
+            return 0
         for stride in (_COARSE, 1):
             clearances = self.clearances(samples[:free:stride], point)
-            if allowed is None:
-                allowed = np.minimum(self.margin, clearances[:, :1]) - _ROUNDING
+            allowed = np.minimum(self.margin, np.maximum.accumulate(clearances, axis=1)) - _ROUNDING
             blocked = np.flatnonzero(np.any(clearances < allowed, axis=0))
             if len(blocked):
                 free = int(blocked[0]) * stride
         return free
+
+    def may_leave(self, point: Array) -> bool:
+        """Whether it is sure not to touch the other arm, or what stands about that, where it stands in the point."""
+        return bool(self.clearances(point[None, self.axes], point)[0, 0] >= min(BETWEEN_SAMPLES, self.margin))
 
     def is_within_limits(self, point: Array) -> bool:
         """Whether its joint angles in the point are within the procedure's limits."""

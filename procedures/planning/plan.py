@@ -111,12 +111,15 @@ class Plan:
         return tuple(constraint for constraint in self.constraints if constraint.use == use)
 
     def replaced(self, dropped: Sequence[PlannedConstraint], by: Plan) -> Plan:
-        """This plan with constraints that will not be visited dropped, and those of another plan in their place."""
+        """This plan with constraints that will not be visited dropped, and those of another plan in their place.
+
+        It is then planned from what the other one was, the transforms that are believed now.
+        """
         names = {constraint.name for constraint in dropped}
         kept = tuple(constraint for constraint in self.constraints if constraint.name not in names)
         refused = {what: self.refused.get(what, 0) + by.refused.get(what, 0) for what in {**self.refused, **by.refused}}
         spread = self.axis_spread if by.axis_spread is None else by.axis_spread
-        return Plan((*kept, *by.constraints), spread, refused, self.provisional, self.planned_from)
+        return Plan((*kept, *by.constraints), spread, refused, self.provisional, by.planned_from)
 
     def to_record(self) -> dict[str, Any]:
         """The content of ``plan.json``, from which :meth:`from_record` makes the same plan to the last bit."""

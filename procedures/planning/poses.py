@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from dualcal_hal.errors import NoPlan
 from dualcal_hal.session.captures import Use
 from dualcal_hal.transforms import Array
-from procedures.planning.advice import advice
+from procedures.planning.advice import advice, counted
 from procedures.planning.belief import Belief
 from procedures.planning.candidates import Candidate, CandidateSource
 from procedures.planning.choice import LEAST_SPREAD, LEAST_TURN, Knowledge, most_informative
@@ -22,12 +22,14 @@ from procedures.planning.ways import Leg, WayFinder
 POINT_SECONDS = 0.1
 """What pictures, corrections and settling take at a position besides the way there, as simulated runs have it."""
 
-_POOLS = (6, 12, 24)  # candidates drawn for each constraint of a use; more where fewer do not do
-_LEAST_WHOLE = 6  # constraints that a pool is large enough for, however few are wanted
+_POOLS = (5, 10, 20)  # candidates drawn for each constraint of a use; more where fewer do not do
+_LEAST_WHOLE = 6  # a pool that is to spread well is large enough for so many, however few are wanted
 _AXES_TRIED = 2000
 _AXES_FOR_ADVICE = 200
 _WAYS_MISSED = 16
-"""Constraints that no way leads to, after which the start or the cell is to blame and no longer the candidates."""
+"""Constraints of a request that no way leads to, after which the start or the cell is to blame and no longer they."""
+
+_WAYS_FOR_ADVICE = 12
 
 _NO_WAY = "no clear way to the constraint"
 
@@ -55,6 +57,11 @@ class _Stop:
     way: tuple[Leg, ...]
     seconds: float
 
+    @property
+    def end(self) -> Posture:
+        """Where the arms are after its last position."""
+        return _end(self.candidate)
+
 
 class PosePlanner:
     """Draws and chooses poses for one belief; the same seed gives the same poses."""
@@ -65,6 +72,8 @@ class PosePlanner:
         self._ways = ways
         self._source = CandidateSource(model, belief, np.random.default_rng(list(seed)))
         self.refused = self._source.refused
+        self._ways_missed = 0
+        self._truly_clear: dict[Candidate, bool] = {}
         self._straight: dict[Candidate, bool] = {}
         self._found: dict[tuple[Posture, Posture], tuple[Leg, ...] | None] = {}
 
@@ -78,21 +87,31 @@ class PosePlanner:
         for request in requests:
             known = self._known(request.captured)
             stops = self._select(request, known, posture)
-            posture = _end(stops[-1].candidate)
+            posture = stops[-1].end
             planned += [self._planned(stop, request, number) for number, stop in enumerate(stops)]
             if request.use == "calibration":
                 spread = Knowledge.together([known, *(stop.candidate.knowledge for stop in stops)]).spread
         return Plan(tuple(planned), spread, dict(self.refused), provisional, self._belief.source)
 
+    def require_candidates(self, request: Request) -> None:
+        """Raises NoPlan where not one constraint of a request is possible, as :meth:`plan` would."""
+        if not self._source.draw(request.positions, 1, _AXES_TRIED):
+            raise NoPlan(self._refusal(request, []))
+
     def _select(self, request: Request, known: Knowledge, start: Posture) -> list[_Stop]:
         """From a pool that grows until it holds a choice that keeps all conditions."""
         pool: list[Candidate] = []
-        drawn, whole = 0, max(_LEAST_WHOLE, request.constraints + len(request.captured))
+        self._ways_missed = 0
+        drawn, whole = 0, request.constraints + len(request.captured)
+        if request.use == "calibration":
+            whole = max(_LEAST_WHOLE, whole)
         for share in _POOLS:
             new = self._source.draw(request.positions, share * whole - drawn, _AXES_TRIED)
             drawn += len(new)
             pool += new
-            stops = self._visitable(pool, request, known, start)
+            # What is captured already may leave no way to a good spread; the run goes on with the best there is.
+            insist = share < _POOLS[-1] or not request.captured
+            stops = self._visitable(pool, request, known, start, insist=insist)
             if stops:
                 return stops
             if not drawn:
@@ -100,36 +119,54 @@ class PosePlanner:
         raise NoPlan(self._refusal(request, pool))
 
     def _visitable(
-        self, pool: list[Candidate], request: Request, known: Knowledge, start: Posture
+        self, pool: list[Candidate], request: Request, known: Knowledge, start: Posture, *, insist: bool
     ) -> list[_Stop] | None:
         """The best choice from the pool in its order of visit; candidates that cannot be visited leave the pool."""
         while len(pool) >= request.constraints:
-            chosen = self._choice(pool, request, known)
+            chosen = self._choice(pool, request, known, insist=insist)
             if chosen is None:
                 return None
-            # Ways cost most to judge: only those of candidates that would be chosen are.
-            lost = [candidate for candidate in chosen if not self._is_straight(candidate)]
-            self.refused["the way between two positions is not clear"] += len(lost)
+            # What costs most to judge is judged only of candidates that would be chosen.
+            lost = self._unfit(chosen)
             if not lost:
                 ordered = self._in_order(chosen, start)
                 stops = self._visit(ordered, start)
-                missed = len(stops) if len(stops) < len(ordered) else self._first_too_close(stops, start)
-                if missed is None:
+                if len(stops) == len(ordered):
                     return stops
-                lost = [ordered[missed]]
+                lost = [ordered[len(stops)]]
+                self._way_missed(request, stops[-1].end if stops else start, lost[0])
             pool[:] = [candidate for candidate in pool if candidate not in lost]
         return None
 
-    def _choice(self, pool: Sequence[Candidate], request: Request, known: Knowledge) -> list[Candidate] | None:
+    def _choice(
+        self, pool: Sequence[Candidate], request: Request, known: Knowledge, *, insist: bool
+    ) -> list[Candidate] | None:
+        """The best of the pool; None if its axes do not spread, if that is insisted on, or its flanges do not turn."""
         calibrates = request.use == "calibration"
         knowledge = [candidate.knowledge for candidate in pool]
         numbers = most_informative(knowledge, request.constraints, known, well_spread=calibrates)
         together = Knowledge.together([known, *(knowledge[i] for i in numbers)])
-        if calibrates and not together.well_spread:
-            self.refused["the axes of the best choice do not spread"] += together.spread < LEAST_SPREAD
-            self.refused["the flange is not turned by 30 degrees about two axes"] += together.turn < LEAST_TURN
-            return None
+        narrow, unturned = together.spread < LEAST_SPREAD, together.turn < LEAST_TURN
+        if calibrates:
+            self.refused["the axes of the best choice do not spread"] += narrow
+            self.refused["the flange is not turned by 30 degrees about two axes"] += unturned
+            if unturned or (narrow and insist):
+                return None
         return [pool[i] for i in numbers]
+
+    def _unfit(self, chosen: Sequence[Candidate]) -> list[Candidate]:
+        """Those that are not clear in the true shapes, or whose positions the passive arm cannot go to straight."""
+        close = [candidate for candidate in chosen if not self._is_truly_clear(candidate)]
+        bent = [candidate for candidate in chosen if candidate not in close and not self._is_straight(candidate)]
+        self.refused["too close in the true shapes"] += len(close)
+        self.refused["the way between two positions is not clear"] += len(bent)
+        return [*close, *bent]
+
+    def _is_truly_clear(self, candidate: Candidate) -> bool:
+        if candidate not in self._truly_clear:
+            postures = (Posture.of(candidate.active, q) for q in candidate.passive)
+            self._truly_clear[candidate] = all(map(self._ways.is_clear_in_true_shapes, postures))
+        return self._truly_clear[candidate]
 
     def _is_straight(self, candidate: Candidate) -> bool:
         """Whether the passive arm can go straight from each position to the next."""
@@ -164,7 +201,6 @@ class PosePlanner:
                 self._found[leads] = self._ways.find(*leads)
             way = self._found[leads]
             if way is None:
-                self._way_missed(*leads)
                 break
             stops.append(_Stop(turned, way, self._ways.travel(posture, way)))
             posture = _end(turned)
@@ -180,47 +216,6 @@ class PosePlanner:
             active=active.nearest_turn(candidate.active, np.array(near.active)),
             passive=candidate.passive + np.where(inside, turn, 0.0),
         )
-
-    def _way_missed(self, start: Posture, goal: Posture) -> None:
-        self.refused[_NO_WAY] += 1
-        if self.refused[_NO_WAY] > _WAYS_MISSED:
-            raise NoPlan(
-                f"no plan: {self.refused[_NO_WAY]} constraints that no clear way leads to, the last one because "
-                f"{self._ways.blocked_by(start, goal)}"
-            )
-
-    # -- final check --------------------------------------------------------------------------------------------
-
-    def _first_too_close(self, stops: Sequence[_Stop], start: Posture) -> int | None:
-        """The number of the first stop that is not clear in the true shapes, at its positions or on the way there."""
-        here = start
-        # Who stands closer than told at first may leave.
-        least = min(self._model.margin, self._exact_clearance(start))
-        for number, stop in enumerate(stops):
-            c = stop.candidate
-            postures = [*self._closest(here, stop.way), *(Posture.of(c.active, q) for q in c.passive)]
-            if min(map(self._exact_clearance, postures)) < least:
-                self.refused["too close in the true shapes"] += 1
-                return number
-            here = _end(c)
-        return None
-
-    def _exact_clearance(self, posture: Posture) -> float:
-        return self._model.exact.clearance(posture.active, posture.passive, self._belief.T_P_A)
-
-    def _closest(self, start: Posture, way: Sequence[Leg]) -> Iterator[Posture]:
-        """Of each leg the checked posture with the least clearance."""
-        geometry, here = self._model.geometry, start
-        for leg in way:
-            moves_active = leg.arm == self._model.active.name
-            own, other = (here.active, here.passive) if moves_active else (here.passive, here.active)
-            body = geometry.active if moves_active else geometry.passive
-            path = body.sampled([own, *leg.waypoints])
-            standing = np.array([other])
-            q_a, q_p = (path, standing) if moves_active else (standing, path)
-            closest = path[int(np.argmin(geometry.clearance(q_a, q_p, self._belief.placement)))]
-            yield Posture.of(closest, other) if moves_active else Posture.of(other, closest)
-            here = Posture(leg.goal, other) if moves_active else Posture(other, leg.goal)
 
     # -- what comes of it ---------------------------------------------------------------------------------------
 
@@ -258,16 +253,37 @@ class PosePlanner:
         known = self._known(request.captured)
 
         def success(model: CellModel, belief: Belief) -> float:
-            source = CandidateSource(model, belief, np.random.default_rng(0))
-            drawn = source.draw(request.positions, _AXES_TRIED, _AXES_FOR_ADVICE)
+            drawn = _drawn_for_advice(model, belief, request)
             return len(drawn) if few else _spread_of_best(drawn, request.constraints, known)
 
-        counts = "; ".join(f"{what}: {count}" for what, count in self.refused.most_common() if count)
         return (
             f"no plan: {len(pool)} candidates for {request.constraints} {request.use} constraints with "
-            f"{request.positions} positions{'' if few else ', and no choice of them will do'}. Refused: {counts}. "
+            f"{request.positions} positions{'' if few else ', and no choice of them will do'}. "
+            f"{counted(self.refused)}. {advice(self._model, self._belief, success)}"
+        )
+
+    def _way_missed(self, request: Request, here: Posture, last: Candidate) -> None:
+        self._ways_missed += 1
+        self.refused[_NO_WAY] += 1
+        if self._ways_missed <= _WAYS_MISSED:
+            return
+
+        def success(model: CellModel, belief: Belief) -> float:
+            """Candidates that both arms can go to straight from where they are."""
+            ways = WayFinder(model, belief, [])
+            drawn = _drawn_for_advice(model, belief, request)[:_WAYS_FOR_ADVICE]
+            return sum(not ways.blocked_by(here, _begin(candidate)) for candidate in drawn)
+
+        raise NoPlan(
+            f"no plan: {self._ways_missed} {request.use} constraints that no clear way leads to, the last one because "
+            f"{self._ways.blocked_by(here, _begin(self._turned(last, here)))}. {counted(self.refused)}. "
             f"{advice(self._model, self._belief, success)}"
         )
+
+
+def _drawn_for_advice(model: CellModel, belief: Belief, request: Request) -> list[Candidate]:
+    source = CandidateSource(model, belief, np.random.default_rng(0))
+    return source.draw(request.positions, _AXES_TRIED, _AXES_FOR_ADVICE)
 
 
 def _spread_of_best(drawn: Sequence[Candidate], count: int, known: Knowledge) -> float:

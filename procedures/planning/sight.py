@@ -22,6 +22,8 @@ def in_sight(model: CellModel, q_a: ArrayLike, q_p: ArrayLike, belief: Belief) -
     and the round ends of their capsules stick out where the links do not.
     """
     q_a, q_p = (np.atleast_2d(np.asarray(q, dtype=float)) for q in (q_a, q_p))
+    if len(q_a) == 0 or len(q_p) == 0:
+        return np.zeros(0, dtype=bool)
     lens = model.active.chain.forward(q_a) @ belief.T_H_E
     T_A_P = inverse(belief.T_P_A)
     plate = apply(T_A_P @ model.target_in_passive(q_p), _seen_of_plate(model))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +39,8 @@ class WayFinder:
 
     def __init__(self, model: CellModel, belief: Belief, retreats: Iterable[Posture]) -> None:
         self.geometry: CellGeometry = model.geometry
+        self._model = model
+        self._T_P_A = belief.placement.T_P_A
         movers = Mover.both(model, belief.placement)
         self.margin = movers[0].margin
         self._movers = {mover.arm.name: mover for mover in movers}
@@ -49,18 +51,21 @@ class WayFinder:
     def find(self, start: Posture, goal: Posture) -> tuple[Leg, ...] | None:
         """Legs from start to goal, or None if no way was found that keeps clear.
 
-        Straight where that is free, else searched for: by way of a retreat, then by random points. An arm that stands
-        at its goal stays there: leaving it would make it arrive anew. The same query has the same answer, whatever was
-        asked before.
+        Straight where that is free, else searched for: by way of a retreat, then by random points; what is found is
+        checked once more in the true shapes. An arm that stands at its goal stays there: leaving it would make it
+        arrive anew. The same query has the same answer, whatever was asked before.
         """
         here, there = _point(start), _point(goal)
         movers = self._together.moving(here, there)
-        if not all(mover.is_within_limits(there) for mover in movers):
+        if not all(mover.is_within_limits(there) and mover.may_leave(here) for mover in movers):
             return None
         path = self._together.straight(here, there)
         if path is None and all(mover.is_clear(there) for mover in movers) and self._can_alone(here, there):
             path = self._together.around(here, there)
-        return None if path is None else self._legs(path)
+        if path is None:
+            return None
+        way = self._legs(path)
+        return way if self._is_truly_clear(start, way) else None
 
     def clear(self, arm: str, start: Posture, waypoints: ArrayLike) -> bool:
         """Whether one arm's straight moves from ``start`` through waypoints (k, n) keep clear, the other standing."""
@@ -86,7 +91,36 @@ class WayFinder:
         beyond = [m.arm.name for m in self._together.moving(here, there) if not m.is_within_limits(there)]
         if beyond:
             return f"the goal of '{beyond[0]}' is outside its limits"
-        return "; ".join(filter(None, map(self._obstruction, self._together.direct(here, there))))
+        paths = list(self._together.direct(here, there))
+        obstructed = list(filter(None, map(self._obstruction, paths)))
+        if not obstructed and not any(self._is_truly_clear(start, self._legs(path)) for path in paths):
+            return "in their true shapes the arms come too close to each other or to what stands about them"
+        return "; ".join(obstructed)
+
+    def is_clear_in_true_shapes(self, posture: Posture) -> bool:
+        """Whether a posture keeps the procedure's clearance in the true shapes, the bases standing as believed."""
+        return self._true_clearance(_point(posture)) >= self._model.margin
+
+    def _is_truly_clear(self, start: Posture, way: Sequence[Leg]) -> bool:
+        """Whether each leg's posture of least clearance, and where it ends, keep clear in the true shapes.
+
+        Who stands closer than told at first may leave.
+        """
+        least = min((self._true_clearance(point) for point in self._closest(start, way)), default=np.inf)
+        return least >= self._model.margin or least >= self._true_clearance(_point(start))
+
+    def _closest(self, start: Posture, way: Sequence[Leg]) -> Iterator[Array]:
+        """Of each leg the checked point with the least clearance, and its end."""
+        for mover, point, waypoints in self._walk(start, way):
+            samples = mover.samples(waypoints)
+            for q in (samples[np.argmin(mover.clearances(samples, point).min(axis=0))], waypoints[-1]):
+                passed = point.copy()
+                passed[mover.axes] = q
+                yield passed
+
+    def _true_clearance(self, point: Array) -> float:
+        joints = self._model.active.chain.joints
+        return self._model.exact.clearance(point[:joints], point[joints:], self._T_P_A)
 
     def _can_alone(self, here: Array, there: Array) -> bool:
         """Whether each arm could go there if the other were not: most goals without a way fail here, and sooner."""

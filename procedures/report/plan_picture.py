@@ -1,8 +1,12 @@
-"""``plan.png``: both arms at the stand-off, the planned axes and positions, from the side and from above."""
+"""``plan.png``: both arms at the stand-off among what stands about them, the planned axes and positions.
+
+From the side and from above.
+"""
 
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dualcal_hal.config import CellConfig
+from dualcal_hal.geometry import Block, Cylinder, HalfSpace, Mesh, Solid
 from dualcal_hal.session.files import write_atomically
 from dualcal_hal.transforms import Array, apply
 from procedures.planning.model import Posture
@@ -24,6 +29,8 @@ if TYPE_CHECKING:
 SIZE_PX = (1600, 900)
 _DPI = 100
 _BEYOND = 1.08  # how far an axis is drawn, of the distance to its farthest position
+_PLANE = 0.4  # m to each side of a plane's origin that is drawn, and of a base's on the floor
+_ROUND = np.linspace(0.0, 2 * np.pi, 33)
 _USES = {"calibration": (BLUE, "o"), "verification": (GREEN, "s")}
 
 
@@ -53,6 +60,7 @@ def plan_figure(cell: CellConfig, arms: Posture, plan: Plan | None) -> Figure:
         (panels[0], "From the side", np.array([along, up]), "height, mm"),
         (panels[1], "From above", np.array([along, across]), "to the side, mm"),
     ):
+        _draw_surroundings(axes, cell, view)
         _draw_arms(axes, cell, arms, view)
         for constraint in () if plan is None else plan.constraints:
             _draw_constraint(axes, cell, constraint, view)
@@ -67,6 +75,46 @@ def _level_directions(cell: CellConfig) -> tuple[Array, Array]:
     toward = cell.nominal.T_P_A[:3, 3] * [1.0, 1.0, 0.0]
     along = toward / np.linalg.norm(toward) if np.any(np.abs(toward) > 1e-6) else np.array([1.0, 0.0, 0.0])
     return along, np.cross([0.0, 0.0, 1.0], along)
+
+
+def _draw_surroundings(axes: Axes, cell: CellConfig, view: Array) -> None:
+    """Fixtures as the outlines of their convex hulls, with their names, and from the side the floor under each arm."""
+    bases = {"passive_base": np.eye(4), "active_base": cell.nominal.T_P_A}
+    if cell.floor is not None and view[1, 2]:
+        for T_P_base in bases.values():
+            floor = _outline(1e3 * apply(T_P_base, _points_of(HalfSpace()) + [0.0, 0.0, cell.floor]) @ view.T)
+            axes.plot(*floor.T, color=GREY, linewidth=1.5, linestyle="--")
+            x, y = floor[np.argmax(floor[:, 0])]
+            axes.text(x, y, "floor", fontsize=TEXT - 1, color=GREY, ha="right", va="top")
+    for name, fixture in cell.fixtures.items():
+        outline = _outline(1e3 * apply(bases[fixture.base] @ fixture.T, _points_of(fixture.solid)) @ view.T)
+        axes.fill(*outline.T, facecolor=GREY, edgecolor=DARK, alpha=0.35, linewidth=1.5)
+        x, y = (outline.min(axis=0) + outline.max(axis=0)) / 2
+        axes.text(x, y, name, fontsize=TEXT - 1, color=DARK, ha="center", va="center", parse_math=False)
+
+
+def _points_of(solid: Solid) -> Array:
+    """Points (k, 3) in the solid's frame, m, of which its convex hull is drawn; of a plane a part about its origin."""
+    if isinstance(solid, Mesh):
+        return np.reshape(solid.corners, (-1, 3))
+    if isinstance(solid, Cylinder):
+        circle = solid.radius * np.stack([np.cos(_ROUND), np.sin(_ROUND), np.zeros_like(_ROUND)], axis=1)
+        return np.concatenate([circle + [0.0, 0.0, z] for z in (-solid.length / 2, solid.length / 2)])
+    half = solid.sizes / 2 if isinstance(solid, Block) else np.array([_PLANE, _PLANE, 0.0])
+    return np.asarray(half * list(itertools.product([-1.0, 1.0], repeat=3)))
+
+
+def _outline(points: Array) -> Array:
+    """The convex hull (m, 2) of points (k, 2), its first point again at the end; of points on a line its two ends."""
+    from scipy.spatial import ConvexHull
+
+    from_middle = points - points.mean(axis=0)
+    _, size, axes = np.linalg.svd(from_middle, full_matrices=False)
+    if size[1] < 1e-6 * size[0]:
+        along = from_middle @ axes[0]
+        return np.asarray(points[[np.argmin(along), np.argmax(along)]])
+    corners = ConvexHull(points).vertices
+    return np.asarray(points[[*corners, corners[0]]])
 
 
 def _draw_arms(axes: Axes, cell: CellConfig, arms: Posture, view: Array) -> None:

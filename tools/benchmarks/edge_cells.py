@@ -21,6 +21,7 @@ CAMERA_ERROR = 0.01, np.deg2rad(5.6)
 DISTANCES = 0.9, 1.5
 """m between the bases."""
 
+_PAPERS_HOME = (0, 0, 100, 0, 30, 0)  # deg, drawn back so far that no error of the bases lets the arms touch
 _PAPER = Path(__file__).parents[2] / "cells" / "paper.yaml"
 
 
@@ -48,7 +49,7 @@ UR5E = ArmTable(
         (0, 99.6, 0, 0),
     ),
     limits=((-360, 360), (-360, 360), (-180, 180), (-360, 360), (-360, 360), (-360, 360)),
-    home=(180, -120, 110, -80, -90, 0),
+    home=(180, -120, 130, -30, -90, 0),
     radii=(60, 55, 50, 45, 45, 45),
     reach=850,
 )
@@ -95,6 +96,8 @@ def edge_cell(number: int, *, stepper: str, arms: str | None = None) -> str:
     cell: dict[str, Any] = _plain(YAML(typ="safe").load(_PAPER))
     cell["name"] = f"edge-{number}"
     reach = [900.0, 900.0]
+    for robot in cell["robots"].values():
+        robot["home_deg"] = list(_PAPERS_HOME)
     if arms != "paper":
         for i, robot in enumerate(("left", "right")):
             table = list(ARMS.values())[int(rng.integers(len(ARMS)))]
@@ -106,8 +109,7 @@ def edge_cell(number: int, *, stepper: str, arms: str | None = None) -> str:
     away = rng.uniform(-np.pi / 9, np.pi / 9)
     position = distance * np.array([np.cos(away), np.sin(away), 0.0]) + [0.0, 0.0, rng.uniform(-0.1, 0.1)]
     nominal = transform(rotation_from_vector([0.0, 0.0, np.pi + away + rng.uniform(-0.3, 0.3)]), position)
-    camera = transform(rotation_from_vector([0.0, 0.0, rng.uniform(-np.pi, np.pi)]), rng.uniform(-0.06, 0.06, 3))
-    camera[2, 3] = abs(camera[2, 3])
+    camera = _camera_beside_the_wrist(rng)
     cell["nominal"] = {
         "uncertainty": {"translation_mm": BASE_ERROR[0] * 1e3, "rotation_deg": float(np.rad2deg(BASE_ERROR[1]))},
         "active_base_in_passive_base": _written(nominal),
@@ -120,6 +122,13 @@ def edge_cell(number: int, *, stepper: str, arms: str | None = None) -> str:
         "camera_in_active_flange": _written(camera @ _error(rng, *CAMERA_ERROR)),
     }
     return json.dumps(cell, indent=1)
+
+
+def _camera_beside_the_wrist(rng: np.random.Generator) -> Array:
+    """A random T_H_E (4, 4) with the housing clear of the last link, looking along the flange."""
+    around, outwards = rng.uniform(-np.pi, np.pi), rng.uniform(0.085, 0.100)
+    position = [outwards * np.cos(around), outwards * np.sin(around), rng.uniform(0.02, 0.06)]
+    return transform(rotation_from_vector([0.0, 0.0, rng.uniform(-np.pi, np.pi)]), position)
 
 
 def _robot(table: ArmTable) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from procedures.engine import Engine
 from procedures.observers import Observer, Observers
 from procedures.planning.model import CellModel
 from procedures.planning.plan import PLAN_FORMAT, Plan
-from procedures.rehearsal import rehearse
+from procedures.rehearsal import rehearse, require_reach
 from procedures.report import draw_plan, draw_summary
 from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.progress import progress
@@ -61,6 +61,7 @@ def run_cell(options: RunOptions) -> int:
     if options.dry_run:
         _rehearse(console, file, model, options)
         return 0
+    require_reach(file.cell, model)
     _confirm(cell, options.yes)
     started = utc_now()
     session = Session.create(options.out or _unused_folder(started, file.cell.name), file.text)

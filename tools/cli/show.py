@@ -37,12 +37,16 @@ def show_rehearsal(console: Console, cell: CellConfig, rehearsal: Rehearsal, *, 
             f"\nFrom home to the stand-off: camera and target {stand_off.distance * 1e3:.0f} mm apart, "
             f"the arms {stand_off.clearance * 1e3:.0f} mm clear of each other whatever the bases' error"
         )
-        console.print(way_table(stand_off.way))
+        if stand_off.way:
+            console.print(way_table(stand_off.way))
         for number, taken in enumerate(rehearsal.looks, start=1):
-            console.print(
-                f"Look {number} of {len(rehearsal.looks)}" + ("" if taken.way else ", from where the arms stand")
-            )
-            if taken.way:
+            look = f"Look {number} of {len(rehearsal.looks)}"
+            if taken.way is None:
+                console.print(f"{look} is missed: {taken.missed}")
+            elif not taken.way:
+                console.print(f"{look}, from where the arms stand")
+            else:
+                console.print(look)
                 console.print(way_table(taken.way))
     if rehearsal.plan is None:
         console.print(f"There is no provisional plan from the nominal transforms ({rehearsal.no_plan}).")

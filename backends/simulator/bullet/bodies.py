@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from backends.simulator.bullet.client import pybullet
 from backends.simulator.bullet.solids import box
 from backends.simulator.bullet.urdf import Tool, arm_urdf, link_names
+from dualcal_hal.errors import CellFileError, Problem
 from dualcal_hal.geometry import Block, Cylinder, HalfSpace, Mesh, Solid, camera_box, plate_box
 from dualcal_hal.transforms import Array, quaternion_from_rotation, transform
 
@@ -39,7 +41,8 @@ class BulletBodies:
 
     client: PyBullet's number of this world. arms: the body of each arm by its name; its links -1 to n - 1 are the
     base and those of the chain, link n is what it carries. names: of all parts. standing: for each arm the bodies
-    that it must not touch, with the first of its links that this goes for.
+    that it must not touch, with the first of its links that this goes for. Raises CellFileError for a mesh that
+    PyBullet does not take.
     """
 
     def __init__(self, cell: CellConfig, truth: Truth) -> None:
@@ -48,6 +51,15 @@ class BulletBodies:
         self.arms: dict[str, int] = {}
         self.standing: dict[str, list[Part]] = {name: [] for name in cell.robots}
         self._motors: dict[str, dict[str, Any]] = {}
+        with ExitStack() as if_it_fails:
+            if_it_fails.callback(self.close)
+            self._set_physics()
+            bases = {cell.active_name: truth.T_P_A, cell.passive_name: np.eye(4)}
+            self._add_arms(cell, truth, bases)
+            self._add_surroundings(cell, bases)
+            if_it_fails.pop_all()
+
+    def _set_physics(self) -> None:
         pybullet.setGravity(0, 0, _GRAVITY, physicsClientId=self.client)
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=STEP,
@@ -55,9 +67,6 @@ class BulletBodies:
             solverResidualThreshold=_RESIDUAL,
             physicsClientId=self.client,
         )
-        bases = {cell.active_name: truth.T_P_A, cell.passive_name: np.eye(4)}
-        self._add_arms(cell, truth, bases)
-        self._add_surroundings(cell, bases)
 
     def _add_arms(self, cell: CellConfig, truth: Truth, bases: Mapping[str, Array]) -> None:
         housing = box(*camera_box(cell.camera.body_radius, cell.camera.body_length))
@@ -115,7 +124,13 @@ class BulletBodies:
                 self.standing[arm].append((self._add_shape(HalfSpace(), level, "floor"), _FIRST_ABOVE_FLOOR))
 
     def _add_shape(self, solid: Solid, T_P_solid: Array, name: str) -> int:
-        shape = pybullet.createCollisionShape(**_shape(solid), physicsClientId=self.client)
+        try:
+            shape = pybullet.createCollisionShape(**_shape(solid), physicsClientId=self.client)
+        except pybullet.error as error:
+            if not isinstance(solid, Mesh):
+                raise
+            what = f"too many triangles for PyBullet, {len(solid.corners)}; simplify it"
+            raise CellFileError([Problem(f"fixtures.{name}.mesh", what)]) from error
         position, quaternion = _pose(T_P_solid)
         body: int = pybullet.createMultiBody(
             baseCollisionShapeIndex=shape,
@@ -182,10 +197,12 @@ def _shape(solid: Solid) -> dict[str, Any]:
         case HalfSpace():
             return {"shapeType": pybullet.GEOM_PLANE}
         case Mesh(corners):
+            # Their number is limited: one that triangles share is told once.
+            vertices, indices = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
             return {
                 "shapeType": pybullet.GEOM_MESH,
-                "vertices": corners.reshape(-1, 3).tolist(),
-                "indices": list(range(3 * len(corners))),
+                "vertices": vertices.tolist(),
+                "indices": indices.ravel().tolist(),
                 "flags": pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
             }
     raise TypeError(f"{solid!r} is no shape of a fixture")

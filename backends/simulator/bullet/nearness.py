@@ -21,6 +21,9 @@ BETWEEN, WITHIN = 10.0, 0.2
 """Metres up to which distances between the arms, and of an arm to itself and its surroundings, are measured."""
 
 
+_ROUNDING = 1e-3  # m
+
+
 @dataclass(frozen=True)
 class Near:
     """Two parts and the distance between them in m; below zero they are in contact."""
@@ -42,6 +45,7 @@ class Nearness:
         # How far parts must go at least before any can touch, between the arms and within each.
         self._room_between = 0.0
         self._room_within = dict.fromkeys(arms, 0.0)
+        self._measured_within = dict.fromkeys(arms, WITHIN)
 
     def contact(self, turned: Mapping[str, Array]) -> Near | None:
         """The parts that touch, if any do, after each arm's joints have turned by so much (n,) in rad."""
@@ -66,11 +70,14 @@ class Nearness:
     def _within_arm(self, arm: str) -> Near:
         """The least distance of an arm to itself and to what stands about it."""
         body, own = self._bodies.arms[arm], self._own[arm]
-        points = [point for point in self._points(body, body, WITHIN) if (point[3], point[4]) in own]
+        # It is no farther than it was and has come since; looking no farther spares most of a mesh's triangles.
+        gone = self._measured_within[arm] - self._room_within[arm]
+        within = min(self._measured_within[arm] + gone + _ROUNDING, WITHIN)
+        points = [point for point in self._points(body, body, within) if (point[3], point[4]) in own]
         for other, first_link in self._bodies.standing[arm]:
-            points += [point for point in self._points(body, other, WITHIN) if point[3] >= first_link]
-        near = self._least(points, WITHIN)
-        self._room_within[arm] = near.distance
+            points += [point for point in self._points(body, other, within) if point[3] >= first_link]
+        near = self._least(points, within)
+        self._room_within[arm] = self._measured_within[arm] = near.distance
         return near
 
     def _points(self, first: int, second: int, within: float) -> list[Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Mapping
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,18 +44,20 @@ class BulletStepper(Stepper):
 
     def __init__(self, cell: CellConfig, truth: Truth) -> None:
         super().__init__(cell, truth)
-        self.scene: BulletBodies = BulletBodies(cell, truth)
-        self._nearness = Nearness(cell, self.scene)
         self._time = 0.0
         self._moving: list[str] = []
         self._past: deque[tuple[float, Joints]] = deque(maxlen=_KEPT)
-        self._past.append((0.0, {arm: self.scene.joints(arm) for arm in self.scene.arms}))
         self._steps = itertools.count()
         self._distances: list[tuple[float, Near]] = []
-        self._halt_on_contact(self._past[0][1])
-        if self.fault is not None:
-            self.close()
-            raise Contact("simulator", "open", self.fault, "check home_deg and the bases in the cell file")
+        self.scene: BulletBodies = BulletBodies(cell, truth)
+        with ExitStack() as if_it_fails:
+            if_it_fails.callback(self.close)
+            self._nearness = Nearness(cell, self.scene)
+            self._past.append((0.0, {arm: self.scene.joints(arm) for arm in self.scene.arms}))
+            self._halt_on_contact(self._past[0][1])
+            if self.fault is not None:
+                raise Contact("simulator", "open", self.fault, "check home_deg and the bases in the cell file")
+            if_it_fails.pop_all()
 
     def follow(self, arm: str, path: JointPath, now: float) -> float:
         self._advance(now)

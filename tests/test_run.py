@@ -155,12 +155,7 @@ def test_another_seed_gives_other_poses(session, tmp_path):
 
 def test_without_noise_the_mismatch_vanishes(tmp_path):
     result = dualcal(
-        "run",
-        PAPER,
-        "--json",
-        "--out",
-        tmp_path / "s",
-        *sets(*SMALL, *NOISELESS, "procedure.constraints=5", "procedure.tolerance_px=0.01"),
+        "run", PAPER, "--json", "--out", tmp_path / "s", *sets(*SMALL, *NOISELESS, "procedure.tolerance_px=0.01")
     )
     assert result.exit_code == 0
     assert json.loads(result.stdout)["mismatch_mm"]["after"]["mean"] <= 0.01

@@ -78,10 +78,12 @@ def _changes(model: CellModel, belief: Belief) -> Iterator[_Change]:
         model.but(T_F_T=_along_flange(model.T_F_T)),
         belief,
     )
+    # The placement is as wrong as before but not the nominal's own: so the housing stands where the lens is then.
+    turned = replace(belief, T_H_E=_along_flange(belief.T_H_E), placement=replace(belief.placement))
     yield _Change(
         f"mount the camera on '{model.active.name}' so that it looks away from the flange",
-        model,
-        replace(belief, T_H_E=_along_flange(belief.T_H_E)),
+        model.believing(turned),
+        turned,
     )
 
 

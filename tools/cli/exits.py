@@ -94,6 +94,9 @@ def signals_deferred() -> Iterator[DeferredSignals]:
         yield signals
         _raise_if_received()
     finally:
+        if _received is not None:
+            # The end has begun: another signal must not break into the message that says what was stopped.
+            ignore_signals()
         _deferred = None
         signals.close()
 

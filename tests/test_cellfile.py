@@ -617,7 +617,7 @@ def test_mistakes_of_file_and_settings_are_told_together(path: Path) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    st.floats(-90, 90),
+    st.floats(-87, 87),
     st.from_regex(re.compile(r"\w[\w .-]*", re.ASCII), fullmatch=True),
 )
 def test_a_text_with_settings_reads_back_as_the_same_cell(path: Path, home: float, name: str) -> None:

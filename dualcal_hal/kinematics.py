@@ -59,17 +59,15 @@ class Chain:
             raise ValueError(f"expected {self.joints} joint angles, got {q.shape[-1]}")
         angles = (q + self._theta).reshape(-1, self.joints)
         cosine, sine = np.cos(angles)[:, :, None], np.sin(angles)[:, :, None]
-        frames = np.zeros((len(angles), self.joints + 1, 4, 4))
+        after = self._after_joint
+        rows = np.empty((len(angles), self.joints, 4, 4))
+        rows[:, :, 0] = cosine * after[:, 0] - sine * after[:, 1]
+        rows[:, :, 1] = sine * after[:, 0] + cosine * after[:, 1]
+        rows[:, :, 2:] = after[:, 2:]
+        frames = np.empty((len(angles), self.joints + 1, 4, 4))
         frames[:, 0] = np.eye(4)
-        turned = np.empty((len(angles), 3, 4))
-        for i, after in enumerate(self._after_joint):
-            before = frames[:, i, :3]
-            c, s = cosine[:, i], sine[:, i]
-            turned[:, :, 0] = c * before[:, :, 0] + s * before[:, :, 1]
-            turned[:, :, 1] = c * before[:, :, 1] - s * before[:, :, 0]
-            turned[:, :, 2:] = before[:, :, 2:]
-            frames[:, i + 1, :3] = (turned.reshape(-1, 4) @ after).reshape(-1, 3, 4)
-        frames[:, 1:, 3, 3] = 1.0
+        for i in range(self.joints):
+            np.matmul(frames[:, i], rows[:, i], out=frames[:, i + 1])
         return frames.reshape(*q.shape[:-1], self.joints + 1, 4, 4)
 
     def forward(self, q: ArrayLike) -> Array:

@@ -56,6 +56,10 @@ class CellGeometry:
         """
         active = self.active.segments(np.atleast_2d(np.asarray(q_a, dtype=float)))
         passive = self.passive.segments(np.atleast_2d(np.asarray(q_p, dtype=float)))
+        return self.between_at(active, passive, placement)
+
+    def between_at(self, active: Array, passive: Array, placement: Placement) -> Array:
+        """The same, (k,) in m, with the capsules' ends at (k or 1, c, 2, 3), those of each arm in its base."""
         T_A_P = inverse(placement.T_P_A)
         passive = apply(T_A_P, passive.reshape(-1, 3)).reshape(passive.shape)
         least = self._between_arms(active, passive, placement)

@@ -52,7 +52,9 @@ class Session:
         """Store an image losslessly and durably."""
         import cv2
 
-        _, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        # Sensor noise does not repeat: to look for what does costs half as much again and makes the file larger.
+        strategy = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+        _, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1, *strategy])
         write_atomically(self.image_path(name), png.tobytes())
 
     def read_image(self, name: str) -> Image:

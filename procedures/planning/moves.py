@@ -58,12 +58,13 @@ class Mover:
 
         (2, k) in m: to the other arm and what stands about its base, and to the floor, its own fixtures and itself.
         """
-        own = self._body.own_clearance(q)
+        segments = self._body.segments(q)
+        own = self._body.own_clearance_at(segments)
         if self.is_alone:
             return np.stack([np.full(len(q), np.inf), own])
-        there = point[None, self.standing_axes]
-        between = self.geometry.between(*((q, there) if self.is_active else (there, q)), self.placement)
-        return np.stack([between, own])
+        standing = self._standing_body.segments(point[None, self.standing_axes])
+        both = (segments, standing) if self.is_active else (standing, segments)
+        return np.stack([self.geometry.between_at(*both, self.placement), own])
 
     def free_samples(self, samples: Array, point: Array) -> int:
         """How many of the samples (k, n) of a move can be passed from its first on.
@@ -72,10 +73,10 @@ class Mover:
         where the bases may be so wrong that it touches the other arm: then every way could lead deeper into it.
         """
         free = len(samples)
-        if not self.may_leave(point):
-            return 0
         for stride in (_COARSE, 1):
             clearances = self.clearances(samples[:free:stride], point)
+            if clearances[0, 0] < self._least_to_leave:
+                return 0
             allowed = np.minimum(self.margin, np.maximum.accumulate(clearances, axis=1)) - _ROUNDING
             blocked = np.flatnonzero(np.any(clearances < allowed, axis=0))
             if len(blocked):
@@ -84,7 +85,7 @@ class Mover:
 
     def may_leave(self, point: Array) -> bool:
         """Whether it is sure not to touch the other arm, or what stands about that, where it stands in the point."""
-        return bool(self.clearances(point[None, self.axes], point)[0, 0] >= min(BETWEEN_SAMPLES, self.margin))
+        return bool(self.clearances(point[None, self.axes], point)[0, 0] >= self._least_to_leave)
 
     def is_within_limits(self, point: Array) -> bool:
         """Whether its joint angles in the point are within the procedure's limits."""
@@ -110,5 +111,13 @@ class Mover:
         return least, closest_of_active(self.geometry, self.placement, there, q, self.standing.name)
 
     @property
+    def _least_to_leave(self) -> float:
+        return min(BETWEEN_SAMPLES, self.margin)
+
+    @property
     def _body(self) -> ArmBody:
         return self.geometry.active if self.is_active else self.geometry.passive
+
+    @property
+    def _standing_body(self) -> ArmBody:
+        return self.geometry.passive if self.is_active else self.geometry.active

@@ -73,17 +73,20 @@ class ArmBody:
 
     def own_clearance_at(self, segments: Array) -> Array:
         """The same, (k,) in m, with the capsules' ends at (k, c, 2, 3) in the arm's base."""
+        return np.asarray(self.own_clearances_at(segments).min(axis=0))
+
+    def own_clearances_at(self, segments: Array) -> Array:
+        """The same, (2 + fixtures, k): to itself, to the floor, to each of the fixtures of its base."""
         radius = self.capsules.radius
-        least = np.full(len(segments), np.inf)
+        clearances = np.full((2 + len(self.fixtures), len(segments)), np.inf)
+        if len(self.pairs):
+            clearances[0] = (self._own_distances(segments, self.pairs) + self.relief).min(axis=1)
         if self.floor is not None:
             heights = segments[..., 2][:, self.above_floor].min(axis=2) - radius[self.above_floor]
-            least = np.minimum(least, heights.min(axis=1) - self.floor)
-        if len(self.pairs):
-            least = np.minimum(least, (self._own_distances(segments, self.pairs) + self.relief).min(axis=1))
-        for fixture in self.fixtures:
-            distance = fixture.separation(segments[:, self.moving]) - radius[self.moving]
-            least = np.minimum(least, distance.min(axis=1))
-        return np.asarray(least)
+            clearances[1] = heights.min(axis=1) - self.floor
+        for number, fixture in enumerate(self.fixtures, start=2):
+            clearances[number] = (fixture.separation(segments[:, self.moving]) - radius[self.moving]).min(axis=1)
+        return clearances
 
     def sampled(self, waypoints: ArrayLike, largest_motion: float = LARGEST_MOTION) -> Array:
         """Joint waypoints (w, n) to samples (k, n) on the straight segments between them, the waypoints included.

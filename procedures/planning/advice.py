@@ -20,6 +20,7 @@ _TILT = np.deg2rad(15.0)
 _LARGEST_TILT = np.deg2rad(75.0)
 _WIDER = (2 / 3, 4 / 3)
 _CLEARANCE = 0.01  # m
+_MEASURED = 0.04, np.deg2rad(4.0)  # m and rad that the bases may be wrong by after some care with a tape measure
 
 Success = Callable[[CellModel, Belief], float]
 """How well a cell does: larger is better, zero is useless."""
@@ -67,6 +68,14 @@ def _changes(model: CellModel, belief: Belief) -> Iterator[_Change]:
     if tilt > model.tilt_max:
         words = f"raise procedure.tilt_max_deg to {np.rad2deg(tilt):.0f}"
         yield _Change(words, model.but(tilt_max=tilt), belief)
+    placement = belief.placement
+    if placement.translation > _MEASURED[0] or placement.rotation > _MEASURED[1]:
+        less = min(placement.translation, _MEASURED[0]), min(placement.rotation, _MEASURED[1])
+        words = (
+            "measure the bases, correct the nominal transforms and lower nominal.uncertainty to "
+            f"{less[0] * 1e3:.0f} mm and {np.rad2deg(less[1]):.0f} deg"
+        )
+        yield _Change(words, model, replace(belief, placement=Placement(belief.T_P_A, *less)))
     if model.margin > _CLEARANCE:
         words = f"lower procedure.clearance_mm to {_CLEARANCE * 1e3:.0f}"
         yield _Change(words, model.but(margin=_CLEARANCE), belief)

@@ -90,7 +90,7 @@ class CandidateSource:
         self.refused["the axis misses what the passive arm reaches"] += int(np.sum(~served))
         q = q[served]
         clear = self._model.geometry.active.own_clearance(q) >= self._margin if len(q) else served[:0]
-        self.refused["the active arm is too close to itself or the floor"] += int(np.sum(~clear))
+        self.refused["the active arm is too close to itself, the floor or a fixture"] += int(np.sum(~clear))
         return np.asarray(q[clear])
 
     def _along(self, active: Array, positions: int) -> list[Candidate]:
@@ -148,7 +148,7 @@ class CandidateSource:
         seen = model.in_view(T_E_T)
         self._count("the target is not wholly in view", seen)
         own = self._model.geometry.passive.own_clearance(q[which]) if len(which[0]) else np.zeros(0)
-        self._count("the passive arm is too close to itself or the floor", own[seen] >= self._margin)
+        self._count("the passive arm is too close to itself, the floor or a fixture", own[seen] >= self._margin)
         good = seen & (own >= self._margin)
         which = tuple(w[good] for w in which)
         usable = np.zeros(reached.shape, dtype=bool)

@@ -22,6 +22,7 @@ from dualcal_hal.transforms import Array, Mask, inverse, rotation_from_vector, s
 from procedures.planning.advice import advice, counted
 from procedures.planning.belief import Belief
 from procedures.planning.model import ArmModel, CellModel, Posture
+from procedures.planning.obstacles import closer_than
 from procedures.planning.sight import in_sight
 from procedures.planning.ways import Leg, WayFinder
 
@@ -51,6 +52,7 @@ _GOOD_DISTANCE = 0.65  # m between camera and board
 _TOO_CLOSE = "an arm is too close to the other, itself or what stands about it"
 _NOT_IN_VIEW = "the target is not wholly in view"
 _HIDDEN = "an arm or a fixture hides the target"
+_AT_HOME = 0.02  # rad
 _LEAST_APART = 1e-3  # m between the bases on the level
 _SEARCH_RINGS = np.deg2rad([12.0, 20.0])
 _CAMERA_ROLLS = np.deg2rad([40.0, 25.0, 12.0, 60.0])
@@ -90,8 +92,12 @@ def find_stand_off(model: CellModel, belief: Belief, ways: WayFinder, start: Pos
 
 
 def _what_to_jog(model: CellModel, ways: WayFinder, start: Posture, goal: Posture) -> str:
-    """The arm to move by hand so that there is a way."""
+    """The arm to move by hand so that there is a way; from home, to where."""
     home = model.home
+    if np.allclose([*start.active, *start.passive], [*home.active, *home.passive], atol=_AT_HOME):
+        return (
+            "choose another home_deg in the cell file, clear of what is in the way, jog the arms there and begin anew"
+        )
     for arm, q, instead in (
         (model.passive, home.passive, Posture(start.active, home.passive)),
         (model.active, home.active, Posture(home.active, start.passive)),
@@ -273,8 +279,9 @@ def _facing_pairs(model: CellModel, belief: Belief, seed: int, refused: Counter[
         return []
     geometry, margin = model.geometry, model.margin + BETWEEN_SAMPLES
     own_a, own_p = geometry.active.own_clearance(q_a), geometry.passive.own_clearance(q_p)
-    for arm, own in ((model.active, own_a), (model.passive, own_p)):
-        refused[f"'{arm.name}' is too close to itself, the floor or a fixture"] += int(np.sum(own < margin))
+    for arm, body, q in ((model.active, geometry.active, q_a), (model.passive, geometry.passive, q_p)):
+        for what, count in closer_than(margin, body, q).items():
+            refused[f"'{arm.name}' is too close to {what}"] += count
     merit_a = _ease(model.active, q_a) + np.minimum(own_a, 0.1)
     merit_p = _ease(model.passive, q_p) + np.minimum(own_p, 0.1)
     pairs = list(itertools.product(_best(merit_a, own_a >= margin), _best(merit_p, own_p >= margin)))

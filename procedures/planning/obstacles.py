@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -14,9 +15,13 @@ _NOTHING = Capsules(np.zeros(0, dtype=np.int64), np.zeros((0, 2, 3)), np.zeros(0
 
 def closest_own(body: ArmBody, q: Array) -> str:
     """What the arm at joint angles (n,) is closest to of itself, the floor and the fixtures of its base."""
-    obstacles = [("itself", _alone(body)), ("the floor", _alone(body, floor=body.floor))]
-    obstacles += [(f"'{fixture.name}'", _alone(body, fixtures=[fixture])) for fixture in body.fixtures]
-    return min(obstacles, key=lambda named: float(named[1].own_clearance(q)[0]))[0]
+    return _own(body)[int(np.argmin(body.own_clearances_at(body.segments(q[None]))[:, 0]))]
+
+
+def closer_than(margin: float, body: ArmBody, q: Array) -> Counter[str]:
+    """In how many of the postures (k, n) the arm is closer than ``margin`` (m) to which of these."""
+    close = body.own_clearances_at(body.segments(q)) < margin
+    return Counter(dict(zip(_own(body), np.sum(close, axis=1).tolist(), strict=True)))
 
 
 def closest_of_passive(geometry: CellGeometry, placement: Placement, q_a: Array, q_p: Array, arm: str) -> str:
@@ -51,6 +56,11 @@ def _pieces(body: ArmBody, arm: str, tool: str) -> Iterator[tuple[str, ArmBody]]
         yield f"'{fixture.name}'", _alone(body, fixtures=[fixture])
 
 
-def _alone(body: ArmBody, floor: float | None = None, fixtures: Sequence[Fixture] = ()) -> ArmBody:
+def _own(body: ArmBody) -> list[str]:
+    """What an arm's own clearances are of, in their order."""
+    return ["itself", "the floor", *(f"'{fixture.name}'" for fixture in body.fixtures)]
+
+
+def _alone(body: ArmBody, fixtures: Sequence[Fixture] = ()) -> ArmBody:
     """The arm without anything about it but what is given."""
-    return ArmBody(body.chain, body.links, body.tool, floor, fixtures)
+    return ArmBody(body.chain, body.links, body.tool, None, fixtures)

@@ -120,6 +120,20 @@ def test_bases_too_close_for_the_error_allowed_have_no_stand_off_and_are_told_to
     assert "mm farther apart; or give procedure.stand_off" in why
 
 
+def test_bases_of_which_too_little_is_known_are_to_be_measured():
+    with pytest.raises(NoPlan) as refusal:
+        found_from(Posture(HOME, HOME), "nominal.uncertainty={translation_mm: 900, rotation_deg: 25}")
+    why = str(refusal.value)
+    assert "the arms are too close to each other: " in why
+    assert "measure the bases, correct the nominal transforms and lower nominal.uncertainty to 40 mm and 4 deg" in why
+
+
+def test_a_fixture_that_leaves_no_room_for_a_stand_off_is_named():
+    shelf = "at: {translation_mm: [450, 0, 500], rotation_vector_deg: [0, 0, 0]}, box_mm: [600, 1200, 600]"
+    with pytest.raises(NoPlan, match=r"'right' is too close to 'shelf': \d+"):
+        found_from(Posture(HOME, HOME), f"fixtures={{shelf: {{in: passive_base, {shelf}}}}}")
+
+
 @pytest.mark.slow
 def test_a_camera_that_looks_back_at_its_arm_has_no_stand_off_and_is_to_be_mounted_the_other_way():
     with pytest.raises(
@@ -176,6 +190,17 @@ def test_without_a_way_to_the_stand_off_the_arm_that_would_free_it_is_named(free
     close = "nominal.active_base_in_passive_base.translation_mm=[900, 0, 0]"
     with pytest.raises(NoPlan, match=rf"'left' may touch link 3 of 'right'.*: {advice}"):
         found_from(Posture(REACHING, REACHING), close)
+
+
+def test_where_home_itself_leaves_no_way_another_home_is_asked_for(monkeypatch):
+    monkeypatch.setattr(WayFinder, "find", lambda self, start, goal: None)
+    with pytest.raises(NoPlan, match=r"\): choose another home_deg in the cell file"):
+        found_from(Posture(HOME, HOME))
+
+
+def test_where_only_the_bases_error_leaves_no_way_from_home_they_are_to_be_measured():
+    with pytest.raises(NoPlan, match=r"\): measure the bases better and lower nominal\.uncertainty, or choose another"):
+        found_from(Posture(HOME, HOME), "nominal.uncertainty={translation_mm: 400, rotation_deg: 30}")
 
 
 # -- looks -----------------------------------------------------------------------------------------

@@ -95,9 +95,11 @@ def _what_to_jog(model: CellModel, ways: WayFinder, start: Posture, goal: Postur
     """The arm to move by hand so that there is a way; from home, to where."""
     home = model.home
     if np.allclose([*start.active, *start.passive], [*home.active, *home.passive], atol=_AT_HOME):
-        return (
-            "choose another home_deg in the cell file, clear of what is in the way, jog the arms there and begin anew"
-        )
+        another = "choose another home_deg in the cell file, clear of what is in the way, jog the arms there"
+        known = model.nominal.as_if_looked()
+        if WayFinder(model, known, [home]).find(start, goal) is not None:
+            return f"measure the bases better and lower nominal.uncertainty, or {another}"
+        return another
     for arm, q, instead in (
         (model.passive, home.passive, Posture(start.active, home.passive)),
         (model.active, home.active, Posture(home.active, start.passive)),

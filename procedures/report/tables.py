@@ -201,5 +201,6 @@ def _plan_notes(plan: Plan) -> Iterator[str]:
     yield f"About {plan.seconds:.0f} s in all: ways, moves between the points, and pictures."
     if plan.axis_spread is not None:
         yield f"Spread of the axes {plan.axis_spread:.3f}: least eigenvalue of mean(z z^T), at least {LEAST_SPREAD:g}."
-    yield "clear: whatever the bases' error; manip.: sqrt(det J J^T); to limit: of the"
-    yield "joint nearest to the limits a procedure keeps. Each is the least of both arms."
+    error = "whatever the bases' error is after the looks" if plan.provisional else "whatever the bases' error"
+    yield f"clear: {error}; manip.: sqrt(det J J^T); to limit:"
+    yield "of the joint nearest to the limits a procedure keeps. Each is the least of both arms."

@@ -136,7 +136,7 @@ def execute(
             with _documents_kept(opened, session):
                 engine.run(calibration.steps())
     except Exception as error:
-        error.add_note(f"what was captured is in {session.folder}")
+        error.add_note(f"the session is kept in {session.folder}")
         raise
 
 

@@ -163,11 +163,33 @@ def test_the_true_camera_sticks_out_of_the_planners_capsule_by_less_than_the_cle
 def test_parts_are_as_far_apart_as_the_planners_shapes_are_or_farther(bodies: BulletBodies) -> None:
     file = cell()
     geometry, placement = CellGeometry.of(file.cell), Placement(truth_of(file).T_P_A, 0.012, 0.0)
-    nearness, rng = Nearness(file.cell, bodies), np.random.default_rng(2)
+    nearness, rng = Nearness(bodies), np.random.default_rng(2)
     for q_a, q_p in rng.uniform(-1.5, 1.5, (100, 2, 6)):
         bodies.put(ACTIVE, q_a)
         bodies.put(PASSIVE, q_p)
         assert nearness.between_arms().distance >= geometry.between(q_a, q_p, placement)[0]
+
+
+@pytest.mark.parametrize("arm", [ACTIVE, PASSIVE])
+def test_an_arm_that_meets_itself_in_the_planners_capsules_does_so_here(bodies: BulletBodies, arm: str) -> None:
+    """All pairs of links that can be brought apart, also where others on the same links touch by their make."""
+    geometry, rng = CellGeometry.of(cell().cell), np.random.default_rng(3)
+    shape = geometry.active if arm == ACTIVE else geometry.passive
+    first, second = shape.pairs[np.all(shape.pairs < len(shape.links), axis=1)].T
+    radii = shape.capsules.radius[first] + shape.capsules.radius[second]
+    nearness, met = Nearness(bodies), set()
+    for q in rng.uniform(-np.pi, np.pi, (300, 6)):
+        bodies.put(arm, q)
+        segments = shape.segments([q])[0]
+        least = float(np.min(segment_distance(segments[first], segments[second]) - radii))
+        contact = nearness.contact({arm: np.full(6, np.inf)})
+        if least < -1e-4:
+            assert contact is not None
+            assert contact.distance <= least + 1e-4
+            met.add((contact.first, contact.second))
+        elif contact is not None and least > 1e-4:
+            assert {contact.first, contact.second} & {"camera of left", "target of right", "floor"}
+    assert len(met) > 5
 
 
 @pytest.mark.parametrize("arm", [ACTIVE, PASSIVE])

@@ -18,7 +18,7 @@ from backends.simulator.scene import FLOOR, SKY, Scene
 from backends.simulator.truth import Truth
 from dualcal_hal.camera import Intrinsics
 from dualcal_hal.cellfile import load_cell
-from dualcal_hal.transforms import Array, Mask, inverse, quaternion_from_rotation, transform
+from dualcal_hal.transforms import Array, Mask, inverse, quaternion_from_rotation, rotation_from_vector, transform
 from tests.cells import NOISELESS, PAPER
 from tests.reference_cell import DOCUMENT
 from tests.rendered_corners import DISTORTION, corners_found, project, random_view
@@ -76,7 +76,10 @@ def renderer() -> Renderer:
 @pytest.fixture
 def cell(renderer: Renderer) -> Iterator[Cell]:
     assert CELL.simulation is not None
-    truth = Truth(CELL.cell, CELL.simulation)
+    yield from built(Truth(CELL.cell, CELL.simulation), renderer)
+
+
+def built(truth: Truth, renderer: Renderer) -> Iterator[Cell]:
     bodies = BulletBodies(CELL.cell, truth)
     yield Cell(bodies, truth, renderer, Scene(bodies, CELL.cell, renderer.rays))
     bodies.close()
@@ -105,6 +108,25 @@ def square(side: float) -> Array:
 @pytest.mark.parametrize("capture", [0, 3, 6, 9, 21, 24, 27])
 def test_the_round_ends_of_the_links_that_carry_the_target_do_not_hide_it(cell: Cell, capture: int) -> None:
     assert cell.scene.view(cell.stand(capture)).hidden is None
+
+
+def test_the_floor_of_one_arm_hides_nothing_of_the_other_however_wrong_the_bases_stand(renderer: Renderer) -> None:
+    """Each arm has a floor under its own base alone; tilted with that base it passes above the other's target."""
+    assert CELL.simulation is not None
+    truth = Truth(CELL.cell, CELL.simulation)
+    q_a, q_p = (np.array(CAPTURES[18][key]) for key in ("active_joints_rad", "passive_joints_rad"))
+    T_P_E, arm = truth.T_P_E(q_a, 0.0), truth.chains[ACTIVE]
+    truth.T_P_A = truth.T_P_A @ transform(rotation_from_vector([0.0, np.deg2rad(-12.0), 0.0]), [0.0, 0.0, 0.1])
+    in_its_floor = inverse(truth.T_P_A) @ truth.chains[PASSIVE].forward(q_p) @ truth.T_F_T
+    assert in_its_floor[2, 3] < -0.1
+    flange = inverse(truth.T_P_A) @ T_P_E @ inverse(truth.T_H_E)
+    (q_a,), (reached,) = arm.inverse(flange, [q_a], np.full(6, -np.pi), np.full(6, np.pi))
+    assert reached
+    for cell in built(truth, renderer):
+        cell.bodies.put(ACTIVE, q_a)
+        cell.bodies.put(PASSIVE, q_p)
+        np.testing.assert_allclose(cell.T_P_E, T_P_E, atol=1e-6)
+        assert cell.scene.view(truth.T_E_T(q_a, q_p, 0.0)).hidden is None
 
 
 def test_the_passive_arm_hides_a_target_that_it_holds_behind_its_forearm(cell: Cell) -> None:

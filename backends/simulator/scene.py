@@ -141,7 +141,7 @@ class Scene:
 
     def __init__(self, bodies: BulletBodies, cell: CellConfig, rays: Values) -> None:
         self._bodies = bodies
-        self._floors = list(_take_over_planes(bodies.client))
+        self._planes = list(_take_over_planes(bodies.client))
         self._camera = bodies.tool(cell.active_name)
         self._frustum = Frustum.around(rays)
         self._rays = self._frustum.rays
@@ -151,13 +151,18 @@ class Scene:
         self._plate = part_code((body, plate))
         self._plate_radius = float(np.linalg.norm(cell.target.plate_outline, axis=1).max())
         # The last two links carry the plate: they are behind it, though their capsules' round ends stick out.
-        self._never_before = [part_code((body, link)) for link in (plate - 2, plate - 1, plate)]
+        carrying = bodies.shapes[cell.passive_name].capsules.frame >= cell.passive.chain.joints - 1
+        links = np.array(bodies.links[cell.passive_name])[carrying]
+        self._never_before = [part_code((body, int(link))) for link in links]
+        # Each arm has a floor under its own base: where the bases stand unlike it passes through the other arm.
+        self._floors = [part_code((body, -1)) for body in bodies.floors]
+        self._never_before += self._floors
 
     def view(self, T_E_T: Array) -> View:
         """As things stand, with the target at ``T_E_T`` (4, 4)."""
         T_world_E = self._bodies.link_pose(*self._camera)
         picture = render_scene(self._bodies.client, T_world_E, self._frustum)
-        for body, T_world_plane in self._floors:
+        for body, T_world_plane in self._planes:
             self._lay(picture, body, inverse(T_world_E) @ T_world_plane)
         grey = picture.grey
         if inverse(T_E_T)[2, 3] > 0:
@@ -167,10 +172,12 @@ class Scene:
         return View(self._enlarged(grey), share)
 
     def _lay(self, picture: Picture, body: int, T_E_plane: Array) -> None:
-        """Draw an infinite plane z = 0 whose front is seen where nothing else is nearer."""
-        depth = self._plane_depth(T_E_plane)
+        """Draw an infinite plane z = 0 whose front is seen where nothing else is nearer; a floor behind all else."""
+        depth, plane = self._plane_depth(T_E_plane), part_code((body, -1))
         seen = (depth > 0) & (depth < picture.depth) & bool(inverse(T_E_plane)[2, 3] > 0)
-        picture.grey[seen], picture.depth[seen], picture.part[seen] = FLOOR, depth[seen], part_code((body, -1))
+        if plane in self._floors:
+            seen &= (picture.part < 0) | np.isin(picture.part, self._floors)
+        picture.grey[seen], picture.depth[seen], picture.part[seen] = FLOOR, depth[seen], plane
 
     def _plane_depth(self, T_E_plane: Array) -> Array:
         """Depth (height, width) in m at which the plane z = 0 is met; 0 where that is not before the camera."""

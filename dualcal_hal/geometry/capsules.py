@@ -63,7 +63,7 @@ def link_capsules(chain: Chain, radii: ArrayLike) -> Capsules:
             frame.append(i + 1)
             ends.append([start, np.zeros(3)])
             radius.append(r)
-    return Capsules(np.array(frame), np.array(ends), np.array(radius))
+    return Capsules(np.array(frame, dtype=np.int64), np.array(ends).reshape(-1, 2, 3), np.array(radius))
 
 
 def camera_capsule(flange: int, T_H_E: Array, radius: float, length: float) -> Capsules:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,9 +12,21 @@ import numpy as np
 
 from backends.simulator.bullet.client import pybullet
 from backends.simulator.bullet.solids import box
-from backends.simulator.bullet.urdf import Tool, arm_urdf, link_names
+from backends.simulator.bullet.urdf import Tool, arm_urdf, link_name, part_names
 from dualcal_hal.errors import CellFileError, Problem
-from dualcal_hal.geometry import Block, Cylinder, HalfSpace, Mesh, Solid, camera_box, plate_box
+from dualcal_hal.geometry import (
+    ArmBody,
+    Block,
+    Cylinder,
+    HalfSpace,
+    Mesh,
+    Solid,
+    camera_box,
+    camera_capsule,
+    link_capsules,
+    plate_box,
+    plate_capsules,
+)
 from dualcal_hal.transforms import Array, quaternion_from_rotation, transform
 
 if TYPE_CHECKING:
@@ -27,8 +39,6 @@ Part = tuple[int, int]
 STEP = 1 / 240
 """Seconds of simulated time."""
 
-_FIRST_MOVING, _FIRST_ABOVE_FLOOR = 0, 1  # links that fixtures of an arm's own base, and floors, are in the way of
-
 _GRAVITY = -9.81  # m/s^2
 _POSITION_GAIN = 0.3
 # With PyBullet's own 50 iterations and 1e-7 some postures keep an error of 0.1 mrad, or never come to rest.
@@ -39,17 +49,20 @@ _FORCE = 2000.0  # N m; the drives are never too weak
 class BulletBodies:
     """Placed by the truth, in the passive base's frame; moved by the arms' motors alone, not by contact.
 
-    client: PyBullet's number of this world. arms: the body of each arm by its name; its links -1 to n - 1 are the
-    base and those of the chain, link n is what it carries. names: of all parts. standing: for each arm the bodies
-    that it must not touch, with the first of its links that this goes for. Raises CellFileError for a mesh that
-    PyBullet does not take.
+    client: PyBullet's number of this world. arms: the body of each arm by its name. shapes: of each arm, as it truly
+    is; links: of each arm the one with each of these capsules, all of what it carries on the last. names: of all
+    parts. standing: for each arm the bodies that it must not touch, with the links that this goes for; floors: those
+    that stand for a floor. Raises CellFileError for a mesh that PyBullet does not take.
     """
 
     def __init__(self, cell: CellConfig, truth: Truth) -> None:
         self.client: int = pybullet.connect(pybullet.DIRECT)
         self.names: dict[Part, str] = {}
         self.arms: dict[str, int] = {}
-        self.standing: dict[str, list[Part]] = {name: [] for name in cell.robots}
+        self.shapes: dict[str, ArmBody] = {}
+        self.links: dict[str, list[int]] = {}
+        self.standing: dict[str, list[tuple[int, frozenset[int]]]] = {name: [] for name in cell.robots}
+        self.floors: list[int] = []
         self._motors: dict[str, dict[str, Any]] = {}
         with ExitStack() as if_it_fails:
             if_it_fails.callback(self.close)
@@ -75,11 +88,14 @@ class BulletBodies:
             cell.active_name: Tool("camera", truth.T_H_E, housing),
             cell.passive_name: Tool("target", truth.T_F_T, plate),
         }
+        camera = camera_capsule(cell.active.chain.joints, truth.T_H_E, cell.camera.body_radius, cell.camera.body_length)
+        target = plate_capsules(cell.passive.chain.joints, truth.T_F_T, cell.target.plate_outline)
+        carried = {cell.active_name: camera, cell.passive_name: target}
         for name, robot in sorted(cell.robots.items()):
-            chain = truth.chains[name]
-            self._load(name, arm_urdf(chain, robot.link_radius, tools[name]), bases[name])
-            for link, its_name in enumerate(link_names(chain.joints, tools[name]), start=-1):
-                self.names[self.arms[name], link] = f"{its_name} of {name}"
+            chain, tool = truth.chains[name], tools[name]
+            self.shapes[name] = ArmBody(chain, link_capsules(chain, robot.link_radius), carried[name], None)
+            self._load(name, arm_urdf(chain, robot.link_radius, tool), bases[name])
+            self._number(name, tool)
             self.put(name, robot.home)
 
     def _load(self, arm: str, urdf: str, T_P_base: Array) -> None:
@@ -93,17 +109,28 @@ class BulletBodies:
                 flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
                 physicsClientId=self.client,
             )
-        links = pybullet.getNumJoints(body, physicsClientId=self.client)
-        for link in range(-1, links):
+        for link in range(-1, pybullet.getNumJoints(body, physicsClientId=self.client)):
             pybullet.changeDynamics(
                 body, link, linearDamping=0, angularDamping=0, jointDamping=0, physicsClientId=self.client
             )
             # Contact is looked for, and ends everything: nothing is left for the physics to push apart.
             pybullet.setCollisionFilterGroupMask(body, link, 0, 0, physicsClientId=self.client)
-        joints = links - 1
+
+    def _number(self, arm: str, tool: Tool) -> None:
+        """Find the links by their names: PyBullet numbers them in an order of its own."""
+        body, shape = self.arms[arm], self.shapes[arm]
+        links = {"base": -1}
+        for link in range(pybullet.getNumJoints(body, physicsClientId=self.client)):
+            links[pybullet.getJointInfo(body, link, physicsClientId=self.client)[12].decode()] = link
+        parts = part_names(shape.links)
+        self.links[arm] = [links[part] for part in parts] + [links[tool.name]] * len(shape.tool)
+        for part, frame in zip(parts, shape.links.frame, strict=True):
+            self.names[body, links[part]] = f"{link_name(frame)} of {arm}"
+        self.names[body, links[tool.name]] = f"{tool.name} of {arm}"
+        joints = shape.chain.joints
         self._motors[arm] = {
             "bodyUniqueId": body,
-            "jointIndices": list(range(joints)),
+            "jointIndices": [links[link_name(frame)] for frame in range(1, joints + 1)],
             "controlMode": pybullet.POSITION_CONTROL,
             "forces": [_FORCE] * joints,
             "positionGains": [_POSITION_GAIN] * joints,
@@ -116,12 +143,17 @@ class BulletBodies:
         for name, fixture in cell.fixtures.items():
             owner = roles[fixture.base]
             body = self._add_shape(fixture.solid, bases[owner] @ fixture.T, name)
-            for arm in self.arms:
-                self.standing[arm].append((body, _FIRST_MOVING if arm == owner else _FIRST_ABOVE_FLOOR))
+            for arm, shape in self.shapes.items():
+                self._must_clear(arm, body, shape.moving if arm == owner else shape.above_floor)
         if cell.floor is not None:
             for arm, T_P_base in bases.items():
                 level = T_P_base @ transform(np.eye(3), [0.0, 0.0, cell.floor])
-                self.standing[arm].append((self._add_shape(HalfSpace(), level, "floor"), _FIRST_ABOVE_FLOOR))
+                floor = self._add_shape(HalfSpace(), level, "floor")
+                self.floors.append(floor)
+                self._must_clear(arm, floor, self.shapes[arm].above_floor)
+
+    def _must_clear(self, arm: str, body: int, capsules: Iterable[int]) -> None:
+        self.standing[arm].append((body, frozenset(self.links[arm][i] for i in capsules)))
 
     def _add_shape(self, solid: Solid, T_P_solid: Array, name: str) -> int:
         try:
@@ -144,7 +176,7 @@ class BulletBodies:
 
     def put(self, arm: str, q: Array) -> None:
         """Have an arm stand at joint angles (n,) in rad, and hold them."""
-        for joint, angle in enumerate(q.tolist()):
+        for joint, angle in zip(self._motors[arm]["jointIndices"], q.tolist(), strict=True):
             pybullet.resetJointState(self.arms[arm], joint, angle, physicsClientId=self.client)
         self.drive(arm, q, np.zeros_like(q))
 
@@ -166,7 +198,7 @@ class BulletBodies:
 
     def tool(self, arm: str) -> Part:
         """What an arm carries: the camera, whose link's frame is E, or the target's plate, whose link's is T."""
-        return self.arms[arm], len(self._motors[arm]["jointIndices"])
+        return self.arms[arm], self.links[arm][-1]
 
     def link_pose(self, body: int, link: int) -> Array:
         """(4, 4): a link's frame in the passive base."""

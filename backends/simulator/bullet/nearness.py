@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from backends.simulator.bullet.bodies import BulletBodies, Part
 from backends.simulator.bullet.client import pybullet
-from dualcal_hal.geometry import ArmBody, CellGeometry
+from dualcal_hal.geometry import ArmBody
 from dualcal_hal.transforms import Array
-
-if TYPE_CHECKING:
-    from dualcal_hal.config import CellConfig
 
 BETWEEN, WITHIN = 10.0, 0.2
 """Metres up to which distances between the arms, and of an arm to itself and its surroundings, are measured."""
@@ -36,11 +32,10 @@ class Near:
 class Nearness:
     """Measures no more often than the speed of the parts demands."""
 
-    def __init__(self, cell: CellConfig, bodies: BulletBodies) -> None:
+    def __init__(self, bodies: BulletBodies) -> None:
         self._bodies = bodies
-        shapes = CellGeometry.of(cell)
-        arms = {cell.active_name: shapes.active, cell.passive_name: shapes.passive}
-        self._own = {name: _own_pairs(body) for name, body in arms.items()}
+        arms = bodies.shapes
+        self._own = {name: _own_pairs(body, bodies.links[name]) for name, body in arms.items()}
         self._reach = {name: _reach(body) for name, body in arms.items()}
         # How far parts must go at least before any can touch, between the arms and within each.
         self._room_between = 0.0
@@ -74,8 +69,8 @@ class Nearness:
         gone = self._measured_within[arm] - self._room_within[arm]
         within = min(self._measured_within[arm] + gone + _ROUNDING, WITHIN)
         points = [point for point in self._points(body, body, within) if (point[3], point[4]) in own]
-        for other, first_link in self._bodies.standing[arm]:
-            points += [point for point in self._points(body, other, within) if point[3] >= first_link]
+        for other, links in self._bodies.standing[arm]:
+            points += [point for point in self._points(body, other, within) if point[3] in links]
         near = self._least(points, within)
         self._room_within[arm] = self._measured_within[arm] = near.distance
         return near
@@ -99,10 +94,7 @@ def _reach(body: ArmBody) -> Array:
     return np.asarray(np.cumsum(lengths[::-1])[::-1] + tool)
 
 
-def _own_pairs(body: ArmBody) -> frozenset[Part]:
-    """Pairs of an arm's links, as PyBullet numbers them, all of whose parts can meet and do not touch by their make."""
-    links = [*body.links.frame.tolist(), *[body.chain.joints + 1] * len(body.tool)]
-    apart = {(i, j) for i, j in body.pairs.tolist()}
-    pairs = list(itertools.combinations(range(len(links)), 2))
-    touching = {(links[i], links[j]) for i, j in pairs if (i, j) not in apart}
-    return frozenset((links[i] - 1, links[j] - 1) for i, j in pairs if (links[i], links[j]) not in touching)
+def _own_pairs(body: ArmBody, links: list[int]) -> frozenset[Part]:
+    """Pairs of an arm's links, as PyBullet numbers them, that can meet and do not touch by their make."""
+    pairs = {(links[i], links[j]) for i, j in body.pairs.tolist()}
+    return frozenset(pairs | {(j, i) for i, j in pairs})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,12 @@ class Solid:
         """kg."""
         return DENSITY * self.volume
 
+    @property
+    def inertia(self) -> Array:
+        """(3, 3) kg m^2 about its centre, along the axes of the link's frame."""
+        R = self.T[:3, :3]
+        return np.asarray(self.mass * (R @ np.diag(self.gyration) @ R.T))
+
 
 def capsule(ends: Array, radius: float) -> Solid:
     """About a segment (2, 3); it resists turning like the cylinder of its radius and volume."""
@@ -54,18 +60,6 @@ def ball(radius: float) -> Solid:
     """About the origin."""
     sizes = {"radius": repr(radius)}
     return Solid("sphere", sizes, np.eye(4), 4 / 3 * np.pi * radius**3, np.full(3, 0.4 * radius**2))
-
-
-def inertia(solids: Sequence[Solid]) -> tuple[float, Array, Array]:
-    """Mass in kg, centre (3,) in m and tensor (3, 3) in kg m^2 about it of solids on one link, in its frame."""
-    mass = sum(solid.mass for solid in solids)
-    centre = np.sum([solid.mass * solid.T[:3, 3] for solid in solids], axis=0) / mass
-    tensor = np.zeros((3, 3))
-    for solid in solids:
-        R, lever = solid.T[:3, :3], solid.T[:3, 3] - centre
-        steiner = lever @ lever * np.eye(3) - np.outer(lever, lever)
-        tensor += solid.mass * (R @ np.diag(solid.gyration) @ R.T + steiner)
-    return mass, centre, tensor
 
 
 def numbers(values: Array) -> str:

@@ -52,7 +52,7 @@ class BulletStepper(Stepper):
         self.scene: BulletBodies = BulletBodies(cell, truth)
         with ExitStack() as if_it_fails:
             if_it_fails.callback(self.close)
-            self._nearness = Nearness(cell, self.scene)
+            self._nearness = Nearness(self.scene)
             self._past.append((0.0, {arm: self.scene.joints(arm) for arm in self.scene.arms}))
             self._halt_on_contact(self._past[0][1])
             if self.fault is not None:

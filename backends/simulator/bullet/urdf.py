@@ -9,11 +9,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from backends.simulator.bullet.solids import Solid, ball, capsule, inertia, numbers
-from dualcal_hal.geometry import link_capsules
+from backends.simulator.bullet.solids import Solid, ball, capsule, numbers
+from dualcal_hal.geometry import Capsules, link_capsules
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import Array, apply, rotation_from_vector, transform
 
+_SECOND = ", second part"
 _FREE = {"lower": "-100", "upper": "100", "effort": "1e4", "velocity": "100"}  # others mind the limits
 
 
@@ -26,22 +27,34 @@ class Tool:
     solid: Solid
 
 
-def link_names(joints: int, tool: Tool) -> list[str]:
-    """Of an arm's links in the order of PyBullet, whose base is number -1."""
-    return ["base", *(f"link {number}" for number in range(1, joints + 1)), tool.name]
+def link_name(frame: int) -> str:
+    """Of the link that moves with a frame of the chain."""
+    return "base" if frame == 0 else f"link {frame}"
+
+
+def part_names(capsules: Capsules) -> list[str]:
+    """Of an arm's capsules: a second one on a link is a link of its own, fixed to the first."""
+    frames = capsules.frame.tolist()
+    return [link_name(frame) + (_SECOND if frame in frames[:i] else "") for i, frame in enumerate(frames)]
 
 
 def arm_urdf(chain: Chain, radii: Array, tool: Tool) -> str:
     """An arm on its base with its tool, its links capsules of the given radii (n,) in m.
 
     A link's frame is the joint's, turned: what follows the turn in a Denavit-Hartenberg row is the next joint's origin.
+    Each capsule is a part of its own: of two on one link one may touch a neighbour by its make, and the other may not.
     """
-    names = link_names(chain.joints, tool)
+    names = [*(link_name(frame) for frame in range(chain.joints + 1)), tool.name]
     after = [np.eye(4), *(row.after_joint() for row in chain.rows)]
     robot = ElementTree.Element("robot", name="arm")
     for name, solids in zip(names, [*_links(chain, radii, after), [tool.solid]], strict=True):
         # A link without length is a joint's housing: it weighs something, and its neighbours' round ends cover it.
-        _add_link(robot, name, solids, weight=solids or [ball(float(radii.min()))])
+        link = _add_link(robot, name, solids[0] if solids else ball(float(radii.min())))
+        if solids:
+            _add_shape(link, solids[0])
+        for second in solids[1:]:
+            _add_shape(_add_link(robot, name + _SECOND, second), second)
+            _add_joint(robot, "fixed", name, name + _SECOND, np.eye(4))
     for row, T, (parent, child) in zip(chain.rows, after, itertools.pairwise(names), strict=False):
         joint = _add_joint(robot, "revolute", parent, child, T @ _turned(row.theta))
         ElementTree.SubElement(joint, "axis", xyz="0 0 1")
@@ -60,15 +73,19 @@ def _links(chain: Chain, radii: Array, after: Sequence[Array]) -> list[list[Soli
     return links
 
 
-def _add_link(robot: ElementTree.Element, name: str, solids: Sequence[Solid], weight: Sequence[Solid]) -> None:
+def _add_link(robot: ElementTree.Element, name: str, weight: Solid) -> ElementTree.Element:
     link = ElementTree.SubElement(robot, "link", name=name)
-    mass, centre, tensor = inertia(weight)
+    tensor = weight.inertia
     inertial = ElementTree.SubElement(link, "inertial")
-    ElementTree.SubElement(inertial, "origin", xyz=numbers(centre), rpy="0 0 0")
-    ElementTree.SubElement(inertial, "mass", value=repr(mass))
+    ElementTree.SubElement(inertial, "origin", xyz=numbers(weight.T[:3, 3]), rpy="0 0 0")
+    ElementTree.SubElement(inertial, "mass", value=repr(weight.mass))
     entries = {f"i{'xyz'[i]}{'xyz'[j]}": repr(float(tensor[i, j])) for i in range(3) for j in range(i, 3)}
     ElementTree.SubElement(inertial, "inertia", entries)
-    for solid, purpose in itertools.product(solids, ("visual", "collision")):
+    return link
+
+
+def _add_shape(link: ElementTree.Element, solid: Solid) -> None:
+    for purpose in ("visual", "collision"):
         part = ElementTree.SubElement(link, purpose)
         _add_origin(part, solid.T)
         ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), solid.shape, dict(solid.sizes))

@@ -176,8 +176,8 @@ def test_whatever_end_the_search_starts_from_the_result_is_the_same(
     expected = detected(detector.detect(image, truth)).corners
     find = checkerboard.find_lattices
 
-    def from_another_end(saddles: SaddlePoints, least: int) -> list[Array]:
-        return [lattice[flip] for lattice in find(saddles, least)]
+    def from_another_end(saddles: SaddlePoints, *limits: float) -> list[Array]:
+        return [lattice[flip] for lattice in find(saddles, *limits)]
 
     monkeypatch.setattr(checkerboard, "find_lattices", from_another_end)
     np.testing.assert_allclose(detected(detector.detect(image, truth)).corners, expected, atol=0.005)
@@ -215,7 +215,7 @@ def test_corners_that_are_not_a_boards_are_refused_even_if_the_search_returns_th
     rng = np.random.default_rng(10)
     grid = np.stack(np.meshgrid(np.arange(3), np.arange(3)), axis=-1)
 
-    def anything(saddles: SaddlePoints, least: int) -> list[Array]:
+    def anything(saddles: SaddlePoints, *limits: float) -> list[Array]:
         return [rng.uniform(100, 500, 2) + rng.uniform(15, 60) * grid + rng.normal(0, 1, (3, 3, 2))]
 
     monkeypatch.setattr(checkerboard, "find_lattices", anything)
@@ -230,7 +230,7 @@ def test_a_grid_of_dark_spots_is_no_checkerboard(detector: Detector, monkeypatch
     image = cv2.GaussianBlur(image, (0, 0), 0.6)
     assert missed(detector.detect(image)).reason is Miss.NOT_FOUND
     between = np.array([[(477 + 30 * (j + i), 407 + 30 * (i - j)) for i in range(3)] for j in range(3)], dtype=float)
-    monkeypatch.setattr(checkerboard, "find_lattices", lambda saddles, least: [between])
+    monkeypatch.setattr(checkerboard, "find_lattices", lambda saddles, *limits: [between])
     outcome = missed(detector.detect(image))
     assert outcome.reason is Miss.NOT_FOUND
     assert "meet like squares" in outcome.detail
@@ -250,10 +250,53 @@ def test_a_larger_checkerboard_is_known_by_its_squares_where_its_corners_were_no
     larger = Checkerboard(5, 5, 0.025, 12)
     image = Scene(larger, CAMERA, np.random.default_rng(11)).image(facing())
     inner = project(larger, CAMERA, facing()).reshape(5, 5, 2)[1:4, 1:4]
-    monkeypatch.setattr(checkerboard, "find_lattices", lambda saddles, least: [inner])
+    monkeypatch.setattr(checkerboard, "find_lattices", lambda saddles, *limits: [inner])
     outcome = missed(detector.detect(image))
     assert outcome.reason is Miss.NOT_FOUND
     assert "more corners" in outcome.detail
+
+
+def test_a_larger_checkerboard_is_known_by_a_few_squares_beside_the_part_that_is_seen(detector: Detector) -> None:
+    larger, rng = Checkerboard(5, 5, 0.025, 12), np.random.default_rng(11)
+    corners = project(larger, CAMERA, facing(0.3)).reshape(5, 5, 2)
+    for _ in range(8):
+        image = Scene(larger, CAMERA, rng).image(facing(0.3))
+        for side in (corners[0, 1:4], corners[4, 1:4], corners[1:4, 0], corners[1:4, 4]):
+            for corner in rng.permutation(side)[:2]:
+                covered(image, corner, 110, 23)
+        assert "more corners" in missed(detector.detect(image)).detail
+
+
+def test_a_larger_checkerboard_that_the_edge_cuts_is_known_by_the_squares_in_the_image(detector: Detector) -> None:
+    larger, camera = Checkerboard(4, 5, 0.025, 7), intrinsics(distorted=False)
+    T_E_T = facing(position=((30.0 - 512) * 0.4 / 812, 0.0, 0.4))
+    corners = project(larger, camera, T_E_T).reshape(4, 5, 2)
+    assert np.all(corners[:, 1, 0] < 0)
+    assert np.all(corners[:, 2, 0] > 15)
+    image = Scene(larger, camera, np.random.default_rng(11)).image(T_E_T)
+    for corner in corners[3, 2:4]:
+        covered(image, corner, 110, 23)
+    assert "more corners" in missed(detector.detect(image)).detail
+
+
+def test_something_that_touches_the_board_at_one_place_does_not_matter(scene: Scene, detector: Detector) -> None:
+    truth = project(BOARD, CAMERA, facing()).reshape(3, 3, 2)
+    for i, j in np.ndindex(3, 3):
+        if (i, j) == (1, 1):
+            continue
+        rim = truth[i, j] + (truth[i, j] - truth[1, 1]) * (1 if 1 in (i, j) else (1, 0))
+        image = covered(scene.image(facing()), rim, 20)
+        np.testing.assert_allclose(detected(detector.detect(image)).feature, truth[1, 1], atol=0.05)
+
+
+def test_a_candidate_whose_squares_are_not_convex_is_refused(
+    detector: Detector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dented = np.array([[(400 + 50 * j, 300 + 50 * i) for j in range(3)] for i in range(3)], dtype=float)
+    dented[2, 2] = dented[1, 1] + 5.0
+    monkeypatch.setattr(checkerboard, "find_lattices", lambda saddles, *limits: [dented])
+    outcome = missed(detector.detect(np.full((768, 1024), 128, np.uint8), dented.reshape(-1, 2)))
+    assert "lie like a board's" in outcome.detail
 
 
 def test_a_corner_by_the_edge_of_the_image_is_a_miss_at_the_border(detector: Detector) -> None:
@@ -292,6 +335,26 @@ def test_motion_along_one_direction_blurs_too(scene: Scene, detector: Detector) 
 def test_a_faint_pattern_is_not_found(scene: Scene, detector: Detector) -> None:
     faint = np.rint(100 + 0.08 * scene.image(facing())).astype(np.uint8)
     assert missed(detector.detect(faint, project(BOARD, CAMERA, facing()))).reason is Miss.NOT_FOUND
+
+
+def test_a_faint_pattern_is_not_taken_for_one_that_is_hidden(detector: Detector) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        T_E_T = random_view(rng, BOARD, CAMERA)
+        sharp = Scene(BOARD, CAMERA, rng, noise=0.0).image(T_E_T)
+        faint = 120 + 0.05 * (sharp - 120.0) + rng.normal(0.0, 2.0, sharp.shape)
+        predicted = project(BOARD, CAMERA, T_E_T) + rng.normal(0.0, 60.0, 2)
+        outcome = missed(detector.detect(np.rint(faint).astype(np.uint8), predicted))
+        assert outcome.reason is not Miss.OCCLUDED
+
+
+def test_a_faint_pattern_by_the_edge_is_told_by_its_contrast(detector: Detector) -> None:
+    camera = intrinsics(distorted=False)
+    T_E_T = facing(position=((30.0 - 512) * 0.4 / 812 + BOARD.square, 0.0, 0.4))
+    image = Scene(BOARD, camera, np.random.default_rng(12)).image(T_E_T)
+    outcome = missed(detector.detect(np.rint(100 + 0.08 * image).astype(np.uint8), project(BOARD, camera, T_E_T)))
+    assert outcome.reason is Miss.NOT_FOUND
+    assert "grey levels" in outcome.detail
 
 
 def test_an_empty_image_is_a_miss(detector: Detector) -> None:
@@ -352,10 +415,10 @@ def test_an_image_without_any_sharp_edge_is_blurred(detector: Detector) -> None:
     assert missed(detector.detect(image, project(BOARD, CAMERA, facing(0.5)))).reason is Miss.BLURRED
 
 
-def covered(image: Image, middle: Array, grey: int) -> Image:
+def covered(image: Image, middle: Array, grey: int, half: int = 15) -> Image:
     """The image with a square of one grey value over a corner."""
     x, y = np.rint(middle).astype(int)
-    image[y - 15 : y + 16, x - 15 : x + 16] = grey
+    image[y - half : y + half + 1, x - half : x + half + 1] = grey
     return image
 
 

@@ -22,14 +22,18 @@ def sample(image: Image, pixels: Array) -> Array:
     return np.asarray(map_coordinates(image, [y, x], order=1, mode="nearest", output=float))
 
 
+def quadrants(apart: float = TO_QUADRANT) -> Array:
+    """(4, 2): where from a corner its four squares are looked at, the two of one colour first."""
+    return apart * np.array([[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]])
+
+
 def contrast(image: Image, homography: Array, lattice: Array, apart: float = TO_QUADRANT) -> Array:
     """White minus black around each lattice point, in grey levels (n,), looked at ``apart`` squares from it.
 
     homography: (3, 3) from lattice coordinates (column, row) to px; lattice: (n, 2). The contrast has one sign
     all over a checkerboard, halves at its rim and vanishes in expectation off it.
     """
-    quadrants = apart * np.array([[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]])
-    places = (lattice[:, None] + quadrants).reshape(-1, 1, 2)
+    places = (lattice[:, None] + quadrants(apart)).reshape(-1, 1, 2)
     pixels = np.asarray(cv2.perspectiveTransform(places, homography), dtype=float)
     grey = sample(image, pixels.reshape(-1, 4, 2))
     parity = 1.0 - 2.0 * (np.rint(lattice).sum(axis=1) % 2)

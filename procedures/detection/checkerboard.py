@@ -6,24 +6,25 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import KDTree
 
 from dualcal_hal.camera import Image
 from dualcal_hal.errors import UsageError
 from dualcal_hal.target import Checkerboard
 from dualcal_hal.transforms import Array, Mask
-from procedures.detection.appearance import contrast, gap
+from procedures.detection.appearance import contrast, gap, quadrants
 from procedures.detection.corners import (
-    CONTRAST_LIMIT,
     checked_blur,
     homography,
     inside,
     lattice_points,
+    mapped,
     off_plane,
     refined,
     spacing,
 )
-from procedures.detection.exposure import around, raise_light_problem
+from procedures.detection.exposure import around, raise_if_faint, raise_light_problem
 from procedures.detection.lattice import LEAST_STEP, OFF, find_lattices, find_saddles
 from procedures.detection.outcome import Detection, Miss, Refused, Region
 from procedures.detection.saddle import half_window, reach
@@ -31,13 +32,14 @@ from procedures.detection.saddle import half_window, reach
 GAP_LIMIT = 0.4
 """How far an edge may be from the middle grey, in parts of its contrast: spots with gaps are a half away."""
 GOES_ON_LIMIT = 0.75
-"""Contrast one square outside the corners, in parts of that inside: a half at the rim of a pattern."""
+"""Contrast one square outside a corner, in parts of the corner's own: a half at the rim of a pattern."""
 ALIKE_LIMIT = 0.75
 """An order is known if its misfit to the prediction is below this part of the second best's (38 deg of roll)."""
 PART_LIMIT = 0.5
 """Where at least this part of the predicted corners is seen, the board is there, partly hidden."""
 
 _MORE_CORNERS = "the checkerboard in the image has more corners than the target"
+_NO_RIM = f"{_MORE_CORNERS}, or something lies against its rim; keep a margin around it free"
 _FARTHEST_SHIFT = 2.5  # steps by which a prediction of a board that is partly hidden may be off
 _WIDE = 4.0  # least steps, from which on the image is made smaller for the search
 
@@ -54,12 +56,16 @@ class CheckerboardFinder:
         self._board = board
         self._shape = (board.rows, board.columns)
         self._lattice = lattice_points(range(board.columns), range(board.rows))
-        self._ring = np.concatenate(
+        ring = np.concatenate(
             [
                 lattice_points(range(board.columns), (-1, board.rows)),
                 lattice_points((-1, board.columns), range(board.rows)),
             ]
         )
+        self._ring = ring
+        self._ring_squares = (ring[:, None] + quadrants()).reshape(-1, 2)
+        column, row = np.clip(ring.astype(int), 0, (board.columns - 1, board.rows - 1)).T
+        self._beside_ring = row * board.columns + column
 
     def searches(self, size: tuple[int, int], near: Region | None, step: float) -> Iterator[tuple[Region, int]]:
         """Regions to search, each with the scale for it, the quickest first; ``step``: between corners, in px."""
@@ -73,9 +79,10 @@ class CheckerboardFinder:
         x0, y0, x1, y1 = region
         saddles = find_saddles(image[y0:y1, x0:x1], scale).moved((x0, y0))
         refusal = Refused(Miss.NOT_FOUND, f"no pattern of {self._shape[0]} x {self._shape[1]} corners")
-        for window, ends in itertools.chain.from_iterable(
-            _windows(lattice, self._shape) for lattice in find_lattices(saddles, len(self._lattice))
-        ):
+        # Wider squares have been looked for in the image made smaller.
+        narrowest = _WIDE * LEAST_STEP if scale == 1 else np.inf
+        lattices = find_lattices(saddles, len(self._lattice), narrowest)
+        for window, ends in itertools.chain.from_iterable(_windows(lattice, self._shape) for lattice in lattices):
             if not ends:
                 refusal = Refused(Miss.NOT_FOUND, _MORE_CORNERS)
                 continue
@@ -117,21 +124,27 @@ class CheckerboardFinder:
 
     def _weakest_contrast(self, image: Image, grid: Array, plane: Array) -> float:
         """The contrast of the weakest corner, if black and white alternate over the pattern and no further."""
-        inner = contrast(image, plane, self._lattice)
-        inner *= np.sign(np.median(inner))
-        weakest = float(inner.min())
-        if weakest < CONTRAST_LIMIT:
-            raise Refused(
-                Miss.NOT_FOUND,
-                f"the squares of the candidate differ by {weakest:.0f} grey levels, {CONTRAST_LIMIT:g} at least;"
-                " give it more light, or more exposure",
-            )
+        contrasts = contrast(image, plane, self._lattice)
+        weakest = float((contrasts * np.sign(np.median(contrasts))).min())
+        raise_if_faint(weakest)
         if gap(image, grid) > GAP_LIMIT:
             raise Refused(Miss.NOT_FOUND, "the candidate's dark and bright parts do not meet like squares")
-        outside = abs(float(np.median(contrast(image, plane, self._ring))))
-        if outside > GOES_ON_LIMIT * float(np.median(inner)):
-            raise Refused(Miss.NOT_FOUND, _MORE_CORNERS)
+        if self._goes_on_outside(image, plane, contrasts):
+            raise Refused(Miss.NOT_FOUND, _NO_RIM)
         return weakest
+
+    def _goes_on_outside(self, image: Image, plane: Array, contrasts: Array) -> bool:
+        """Whether the pattern goes on beyond the corners, whose ``contrasts`` (n,) are signed.
+
+        A part of a larger board may show little of what is beside it, the rest being hidden or outside the image. So
+        one place where it goes on is enough, if there is another one that is no rim: a single one may be a shadow's
+        edge, or something that touches the board.
+        """
+        size = (image.shape[1], image.shape[0])
+        in_image = inside(mapped(plane, self._ring_squares).reshape(-1, 4, 2), size, 0.0).all(axis=1)
+        parts = (contrast(image, plane, self._ring) / contrasts[self._beside_ring])[in_image]
+        goes_on, is_no_rim = parts > GOES_ON_LIMIT, np.abs(parts - 0.5) > GOES_ON_LIMIT - 0.5
+        return bool(goes_on.any() and is_no_rim.sum() > 1)
 
     def _raise_if_in_part(self, image: Image, saddles: Array, predicted: Array) -> None:
         """Refused, with the reason for what is missing, if part of the board is seen near the prediction.
@@ -143,6 +156,9 @@ class CheckerboardFinder:
         seen = _near(places, saddles, OFF * step)
         if not PART_LIMIT * len(seen) <= seen.sum() < len(seen):
             return
+        # A faint board loses corners to the noise, not to what is in front.
+        shown = contrast(image, homography(self._lattice, places), self._lattice[seen])
+        raise_if_faint(abs(float(np.median(shown))))
         checked_blur(image, np.where(seen[:, None], places, np.nan).reshape(*self._shape, 2), 0.4 * step)
         said = f"{seen.sum()} of {len(seen)} corners were found"
         if not np.all(inside(places, size, reach(half_window(step)))):
@@ -173,37 +189,39 @@ def _windows(grid: Array, shape: tuple[int, int]) -> list[tuple[Array, bool]]:
     """The parts of a lattice (r, c, 2), NaN where nothing was seen, that are a whole ``shape`` (rows, columns), and
     whether the lattice ends there."""
     found = []
-    for turned, rows_first in ((grid, True), (np.swapaxes(grid, 0, 1), False)):
-        if not rows_first and shape[0] == shape[1]:
-            break
-        for i, j in np.ndindex(*(max(n - m + 1, 0) for n, m in zip(turned.shape[:2], shape, strict=True))):
-            window = turned[i : i + shape[0], j : j + shape[1]]
-            if np.all(np.isfinite(window)):
-                found.append((window, not _goes_on(turned, (i, j), shape)))
+    for turned in (grid, np.swapaxes(grid, 0, 1))[: 1 if shape[0] == shape[1] else 2]:
+        if turned.shape[0] < shape[0] or turned.shape[1] < shape[1]:
+            continue
+        there = np.pad(np.isfinite(turned[..., 0]), 1)
+        whole = sliding_window_view(there[1:-1, 1:-1], shape).all(axis=(2, 3))
+        goes_on = _goes_on(there, shape)
+        for i, j in zip(*np.nonzero(whole), strict=True):
+            found.append((turned[i : i + shape[0], j : j + shape[1]], not goes_on[i, j]))
     return found
 
 
-def _goes_on(grid: Array, at: tuple[int, int], shape: tuple[int, int]) -> bool:
-    """Whether most of a row or column beside the window of ``shape`` at a place of the lattice was seen too."""
-    (i, j), (rows, columns) = at, shape
-    there = np.pad(np.isfinite(grid[..., 0]), 1)
-    beside = (
-        there[i, j + 1 : j + 1 + columns],
-        there[i + rows + 1, j + 1 : j + 1 + columns],
-        there[i + 1 : i + 1 + rows, j],
-        there[i + 1 : i + 1 + rows, j + columns + 1],
-    )
-    return any(2 * int(line.sum()) > len(line) for line in beside)
+def _goes_on(there: Mask, shape: tuple[int, int]) -> Mask:
+    """Whether most of a row or column beside each window of ``shape`` was seen too.
+
+    there: (r + 2, c + 2), whether each corner of the lattice was seen, with a rim where none was.
+    """
+    rows, columns = shape
+    across = sliding_window_view(there[:, 1:-1], columns, axis=1).sum(axis=2)
+    along = sliding_window_view(there[1:-1], rows, axis=0).sum(axis=2)
+    beside_rows = np.maximum(across[: -rows - 1], across[rows + 1 :])
+    beside_columns = np.maximum(along[:, : -columns - 1], along[:, columns + 1 :])
+    return np.asarray((2 * beside_rows > columns) | (2 * beside_columns > rows))
 
 
 def _orders_from_the_front(grid: Array) -> list[Array]:
     """All ways to number ``grid`` (rows, columns, 2) as a board seen from the front: two, four for a square one.
 
-    None if no numbering turns every square the same way round.
+    None if a square's corners do not lie round it in the same sense as those of the others.
     """
     grids = [grid, np.swapaxes(grid, 0, 1)] if grid.shape[0] == grid.shape[1] else [grid]
     flipped = [g[::down, ::right] for g in grids for down in (1, -1) for right in (1, -1)]
-    return [g for g in flipped if _is_from_the_front(g)]
+    orders = [g for g in flipped if _is_from_the_front(g)]
+    return orders if 2 * len(orders) == len(flipped) else []
 
 
 def _is_from_the_front(grid: Array) -> bool:

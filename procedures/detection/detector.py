@@ -15,7 +15,7 @@ from procedures.detection.charuco import CharucoFinder
 from procedures.detection.checkerboard import CheckerboardFinder
 from procedures.detection.corners import inside, spacing
 from procedures.detection.exposure import raise_blur, raise_light_problem
-from procedures.detection.outcome import Detection, Miss, Missed, Refused, Region
+from procedures.detection.outcome import Detection, Faint, Miss, Missed, Refused, Region
 
 _ROOM = 2.5
 """Squares around the predicted corners that are searched first: what the prediction may be off, and a rim."""
@@ -56,14 +56,15 @@ class Detector:
         self._check(image, predicted)
         near = None if predicted is None else self._around(predicted)
         step = 0.0 if predicted is None else self._step(predicted)
-        missed = Missed(Miss.NOT_FOUND, "")
+        refused = Refused(Miss.NOT_FOUND, "")
         for region, scale in self._finder.searches(self.size, near, step):
             try:
                 return self._finder.find(image, region, scale, predicted)
-            except Refused as refused:
+            except Refused as then:
                 # What is cut by the region's edge, or too small at this scale, may yet be found.
-                missed = _more_telling(missed, refused.missed)
-        return missed if missed.reason is not Miss.NOT_FOUND else self._explained(image, near, predicted, missed)
+                refused = _more_telling(refused, then)
+        missed = refused.missed
+        return missed if missed.reason is not Miss.NOT_FOUND else self._explained(image, near, predicted, refused)
 
     def _check(self, image: Image, predicted: Array | None) -> None:
         if image.shape != self.size[::-1] or image.dtype != np.uint8:
@@ -79,6 +80,10 @@ class Detector:
         """About how far in px the corners are from each other, and the pattern's rim from the outer ones."""
         return spacing(predicted.reshape(self.target.rows, self.target.columns, 2))
 
+    def _is_well_inside(self, predicted: Array) -> bool:
+        """Whether the board's rim is expected in the image too."""
+        return bool(np.all(inside(predicted, self.size, self._step(predicted))))
+
     def _around(self, predicted: Array) -> Region | None:
         """The part of the image where the target should be; None if that is outside."""
         room = _ROOM * self._step(predicted)
@@ -86,16 +91,17 @@ class Detector:
         x1, y1 = (int(edge) for edge in np.clip(predicted.max(axis=0) + room, 0, self.size))
         return (x0, y0, x1, y1) if min(x1 - x0, y1 - y0) >= _SMALLEST_REGION else None
 
-    def _explained(self, image: Image, near: Region | None, predicted: Array | None, missed: Missed) -> Missed:
+    def _explained(self, image: Image, near: Region | None, predicted: Array | None, refused: Refused) -> Missed:
         """The reason, as far as the grey values and the prediction tell more than that there is no target."""
         x0, y0, x1, y1 = near or (0, 0, *self.size)
         try:
             raise_light_problem(image[y0:y1:_STRIDE, x0:x1:_STRIDE])
             if near is not None:
                 raise_blur(image[y0:y1, x0:x1])
-        except Refused as refused:
-            return refused.missed
-        if predicted is not None and not np.all(inside(predicted, self.size, self._step(predicted))):
+        except Refused as explained:
+            return explained.missed
+        missed, cut = refused.missed, predicted is not None and not self._is_well_inside(predicted)
+        if cut and not isinstance(refused, Faint):
             return Missed(
                 Miss.AT_BORDER,
                 f"{missed.detail}, and part of it was expected outside the image;"
@@ -113,6 +119,6 @@ def _finder_of(target: Target) -> Finder:
     raise UsageError(f"no detector for a {type(target).__name__}")
 
 
-def _more_telling(first: Missed, then: Missed) -> Missed:
-    """Of two misses of one image the later one, unless it says less."""
-    return first if then.reason is Miss.NOT_FOUND and first.detail else then
+def _more_telling(first: Refused, then: Refused) -> Refused:
+    """Of two refusals of one image the later one, unless it says less."""
+    return first if then.missed.reason is Miss.NOT_FOUND and first.missed.detail else then

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from dualcal_hal.camera import Image
 from dualcal_hal.transforms import Array
 from procedures.detection.corners import BLUR_LIMIT, CONTRAST_LIMIT
-from procedures.detection.outcome import Miss, Refused
+from procedures.detection.outcome import Faint, Miss, Refused
 
 BRIGHTEST = 250
 """Grey level from which on a pixel counts as saturated."""
@@ -35,6 +35,16 @@ def raise_light_problem(values: NDArray[np.uint8]) -> None:
             Miss.TOO_DARK,
             f"where the target should be there is hardly a pixel above {bright:.0f} of 255 grey levels;"
             " lengthen the exposure or give more light",
+        )
+
+
+def raise_if_faint(contrast: float) -> None:
+    """Faint if the white and black of a candidate differ by fewer grey levels than corners need."""
+    if contrast < CONTRAST_LIMIT:
+        raise Faint(
+            Miss.NOT_FOUND,
+            f"the squares of the candidate differ by {contrast:.0f} grey levels, {CONTRAST_LIMIT:g} at least;"
+            " give it more light, or more exposure",
         )
 
 

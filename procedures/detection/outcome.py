@@ -44,6 +44,10 @@ class Refused(Exception):
         self.missed = Missed(reason, detail)
 
 
+class Faint(Refused):
+    """A candidate lies like the target, but its black and white are hardly different."""
+
+
 @dataclass(frozen=True, eq=False)
 class Detection:
     """corners: (n, 2) px in the distorted image, in the board's order, NaN where one was not seen; order_known:

@@ -43,6 +43,9 @@ from procedures.seeing import see
 from procedures.steps import Believe, KeepDocument, KeepImage, Procedure, move, read, task, tell
 
 _TRIES_A_LOOK = 20
+_WHAT_TO_CHECK = (
+    "check square_mm, target_mount, the camera's matrix, the nominal transforms, and order, sign and zero of the joints"
+)
 _REPLACEMENTS = 3
 """Constraints that may be given up, for each that is wanted."""
 
@@ -310,12 +313,13 @@ class Calibration:
     # -- both ---------------------------------------------------------------------------------------------------
 
     def _refine(self) -> Procedure[None]:
-        belief, rms = refine(self._model, self._views)
+        try:
+            belief, rms = refine(self._model, self._views)
+        except ValueError as error:
+            raise NoPlan(f"what the camera saw does not fit this cell: {error}; {_WHAT_TO_CHECK}") from error
         if rms > WORST_FIT:
-            raise NoPlan(
-                f"what the camera saw does not fit this cell: {rms:.1f} px rms over {len(self._views)} views; check "
-                "square_mm, target_mount, the camera's matrix, and order, sign and zero of the joints"
-            )
+            misfit = f"{rms:.1f} px rms over {len(self._views)} views"
+            raise NoPlan(f"what the camera saw does not fit this cell: {misfit}; {_WHAT_TO_CHECK}")
         yield from self._adopt(belief)
         yield from tell(BeliefRefined(len(self._views), rms))
 

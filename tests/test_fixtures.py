@@ -17,6 +17,7 @@ from dualcal_hal.geometry import Block, CellGeometry, Cylinder, Fixture, HalfSpa
 from dualcal_hal.geometry.exact import ExactCell
 from dualcal_hal.geometry.mesh import MOST_VOXELS
 from dualcal_hal.transforms import apply, inverse, rotation_from_vector, smallest_rotation, transform
+from procedures.planning.model import CellModel
 from tests.cells import PAPER, paper_cell
 from tests.reference_cell import NOMINAL_T_P_A
 
@@ -220,6 +221,19 @@ def test_the_final_check_takes_a_mesh_as_it_is(tmp_path):
         expected = by_box.clearance(q_a, home, NOMINAL_T_P_A)
         assert expected < 0.02
         assert by_mesh.clearance(q_a, home, NOMINAL_T_P_A) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_mesh_is_read_once_whatever_is_believed(tmp_path):
+    write_stl(tmp_path / "table.stl", box_triangles(TABLE * 1000))
+    cell = load_cell(cell_with(tmp_path, f"mesh: {{file: table.stl}}, {AT}")).cell
+    model = CellModel(cell)
+    here = model.home.active, model.home.passive, model.nominal.T_P_A
+    expected = model.exact.clearance(*here)
+    (tmp_path / "table.stl").unlink()
+    later = model.believing(model.nominal.as_if_looked())
+    assert later.exact.clearance(*here) == pytest.approx(expected, abs=1e-9)
+    (fixture,), (again,) = (m.geometry.passive.fixtures or m.geometry.active.fixtures for m in (model, later))
+    assert again.solid is fixture.solid
 
 
 def test_the_unit_of_a_mesh_is_what_the_cell_file_says(tmp_path):

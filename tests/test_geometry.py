@@ -172,7 +172,15 @@ def of_length(direction, length):
 
 
 @settings(max_examples=300)
-@given(places, directions, directions, st.floats(0, 0.2), st.floats(0, 0.5), st.floats(0, 1), st.floats(0, 1))
+@given(
+    places,
+    directions,
+    directions,
+    st.floats(0, 0.2),
+    st.floats(0, 0.5) | st.floats(0, 2 * np.pi),
+    st.floats(0, 1),
+    st.floats(0, 1),
+)
 def test_clearance_holds_for_every_error_of_the_bases(ends, along, about, translation, rotation, part, share):
     geometry = two_capsules(ends)
     promised = geometry.between(HERE, HERE, Placement(NOMINAL_T_P_A, translation, rotation))[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -80,9 +81,9 @@ class FixtureConfig(Section):
         """The solid's frame in its base's, (4, 4), m."""
         return self.at.T
 
-    @property
+    @cached_property
     def solid(self) -> Solid:
-        """Its shape, in m; a mesh is read from its file, ValueError if that can no longer be."""
+        """Its shape, in m; a mesh is read from its file once, ValueError if that can no longer be."""
         if self.box_mm is not None:
             return Block(np.array(self.box_mm) / 1000)
         if self.cylinder_mm is not None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
+from pydantic import Field
 
 from dualcal_hal.config.values import NotNegative, Section, TransformConfig
 from dualcal_hal.geometry import Placement
@@ -33,8 +36,8 @@ class UncertaintyConfig(Section):
 
     translation_mm: NotNegative
     """Length of the translation's error, mm."""
-    rotation_deg: NotNegative
-    """Angle of the rotation's error, degrees."""
+    rotation_deg: Annotated[NotNegative, Field(le=180)]
+    """Angle of the rotation's error, degrees; 180 where nothing is known of it."""
 
     @property
     def translation(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -87,6 +88,12 @@ class ArmBody:
         for number, fixture in enumerate(self.fixtures, start=2):
             clearances[number] = (fixture.separation(segments[:, self.moving]) - radius[self.moving]).min(axis=1)
         return clearances
+
+    def without(self, fixture: str) -> ArmBody:
+        """The same without one of the fixtures of its base."""
+        other = copy(self)
+        other.fixtures = tuple(standing for standing in self.fixtures if standing.name != fixture)
+        return other
 
     def sampled(self, waypoints: ArrayLike, largest_motion: float = LARGEST_MOTION) -> Array:
         """Joint waypoints (w, n) to samples (k, n) on the straight segments between them, the waypoints included.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -148,7 +149,7 @@ def _shape(solid: Solid) -> Any:
         return coal.Box(solid.sizes)
     if isinstance(solid, Cylinder):
         return coal.Cylinder(solid.radius, solid.length)
-    return _triangles(solid.corners) if isinstance(solid, Mesh) else _half_space()
+    return _triangles(solid) if isinstance(solid, Mesh) else _half_space()
 
 
 def _half_space() -> Any:
@@ -157,12 +158,13 @@ def _half_space() -> Any:
     return coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
 
 
-def _triangles(corners: Array) -> Any:
+@lru_cache(maxsize=16)  # a mesh is the same for every belief
+def _triangles(mesh: Mesh) -> Any:
     import coal
 
     model = coal.BVHModelOBBRSS()
-    model.beginModel(len(corners), 3 * len(corners))
-    for triangle in corners:
+    model.beginModel(len(mesh.corners), 3 * len(mesh.corners))
+    for triangle in mesh.corners:
         model.addTriangle(*triangle)
     model.endModel()
     return model

@@ -36,6 +36,7 @@ class Placement:
 def farthest_along(n: Array, points: Array, rotation: float) -> Array:
     """How far along directions n (..., 3) points (..., 3) come that turn about the origin by up to ``rotation``, m."""
     along, distance = dot(n, points), length(points)
+    rotation = min(rotation, np.pi)
     across = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
     turned = along * np.cos(rotation) + across * np.sin(rotation)
     return np.asarray(np.where(along >= distance * np.cos(rotation), distance, turned))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualcal_hal.geometry import Placement
+from dualcal_hal.geometry import CellGeometry, Placement
 from dualcal_hal.transforms import Array, smallest_rotation, transform
 from procedures.planning.belief import Belief
 from procedures.planning.model import ArmModel, CellModel
@@ -79,6 +79,9 @@ def _changes(model: CellModel, belief: Belief) -> Iterator[_Change]:
     if model.margin > _CLEARANCE:
         words = f"lower procedure.clearance_mm to {_CLEARANCE * 1e3:.0f}"
         yield _Change(words, model.but(margin=_CLEARANCE), belief)
+    for name in [fixture.name for body in (model.geometry.active, model.geometry.passive) for fixture in body.fixtures]:
+        bodies = model.geometry.active.without(name), model.geometry.passive.without(name)
+        yield _Change(f"move fixtures.{name} out of the way", model.but(geometry=CellGeometry(*bodies)), belief)
     for role, arm in (("active", model.active), ("passive", model.passive)):
         if np.any(arm.limit_margin > 0):
             yield _Change(f"lower limit_margin_deg of '{arm.name}' to 0", model.but(**{role: _unheld(arm)}), belief)

@@ -36,7 +36,8 @@ class Belief:
     def nominal(nominal: NominalConfig) -> Belief:
         """What the cell file says: its largest error is taken for one sigma, which holds nothing back."""
         placement = nominal.placement
-        sigma = np.repeat([placement.translation, placement.rotation, *NOMINAL_SIGMA_CAMERA], 3)
+        bases = np.maximum([placement.translation, placement.rotation], LEAST_ERROR)
+        sigma = np.repeat([*bases, *NOMINAL_SIGMA_CAMERA], 3)
         return Belief(nominal.T_P_A, nominal.T_H_E, np.diag(sigma**2), "the nominal transforms", placement)
 
     def taken_as_exact(self) -> Belief:

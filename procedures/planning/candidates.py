@@ -15,12 +15,13 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dualcal_hal.geometry import BETWEEN_SAMPLES
+from dualcal_hal.geometry import BETWEEN_SAMPLES, ArmBody
 from dualcal_hal.kinematics import random_joints
 from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.planning.belief import Belief
 from procedures.planning.choice import Knowledge
 from procedures.planning.model import ArmModel, CellModel
+from procedures.planning.obstacles import closer_than
 from procedures.planning.sight import in_sight
 
 ROOM = 0.015
@@ -90,7 +91,7 @@ class CandidateSource:
         self.refused["the axis misses what the passive arm reaches"] += int(np.sum(~served))
         q = q[served]
         clear = self._model.geometry.active.own_clearance(q) >= self._margin if len(q) else served[:0]
-        self.refused["the active arm is too close to itself, the floor or a fixture"] += int(np.sum(~clear))
+        self._count_own("active", self._model.geometry.active, q[~clear])
         return np.asarray(q[clear])
 
     def _along(self, active: Array, positions: int) -> list[Candidate]:
@@ -148,7 +149,7 @@ class CandidateSource:
         seen = model.in_view(T_E_T)
         self._count("the target is not wholly in view", seen)
         own = self._model.geometry.passive.own_clearance(q[which]) if len(which[0]) else np.zeros(0)
-        self._count("the passive arm is too close to itself, the floor or a fixture", own[seen] >= self._margin)
+        self._count_own("passive", self._model.geometry.passive, q[which][seen & (own < self._margin)])
         good = seen & (own >= self._margin)
         which = tuple(w[good] for w in which)
         usable = np.zeros(reached.shape, dtype=bool)
@@ -189,6 +190,11 @@ class CandidateSource:
 
     def _count(self, condition: str, kept: Mask) -> None:
         self.refused[condition] += int(kept.size - np.sum(kept))
+
+    def _count_own(self, role: str, body: ArmBody, close: Array) -> None:
+        """Postures (k, n) that are too close to something of the arm's own, by what that is."""
+        for what, count in closer_than(self._margin, body, close).items():
+            self.refused[f"the {role} arm is too close to {what}"] += count
 
     @cached_property
     def _library(self) -> _Library:

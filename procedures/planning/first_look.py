@@ -22,7 +22,7 @@ from dualcal_hal.transforms import Array, Mask, inverse, rotation_from_vector, s
 from procedures.planning.advice import advice, counted
 from procedures.planning.belief import Belief
 from procedures.planning.model import ArmModel, CellModel, Posture
-from procedures.planning.obstacles import closer_than
+from procedures.planning.obstacles import closer_than, closest_own
 from procedures.planning.sight import in_sight
 from procedures.planning.ways import Leg, WayFinder
 
@@ -36,6 +36,7 @@ STAND_OFF_CLEARANCE = 0.25
 _LEAST_FORWARD, _MOST_FORWARD = 0.225, 0.425  # m in front of its own base, the middle of what is tried
 _FORWARD = (-0.025, 0.025, -0.075, 0.075)  # m from there
 _HEIGHT = (0.50, 0.45, 0.55, 0.40, 0.60)  # m above its own base
+_FARTHER = (0.0, 0.2)  # m forward and up, for arms that cannot fold so close to their bases
 _ROLLS = np.deg2rad([0.0, 90.0, 180.0, -90.0])
 _STARTS = 6
 _PAIRS_COMPARED = 12
@@ -117,20 +118,39 @@ def _degrees(q: Joints) -> str:
 def _require_fit(model: CellModel, belief: Belief, ways: WayFinder, posture: Posture) -> None:
     for arm, q in ((model.active, posture.active), (model.passive, posture.passive)):
         if arm.joint_margin(q) < 0:
-            joint = int(np.argmin(np.minimum(q - arm.lower, arm.upper - q))) + 1
+            joint = int(np.argmin(np.minimum(q - arm.lower, arm.upper - q)))
+            low, high = np.rad2deg([arm.lower[joint], arm.upper[joint]])
             raise NoPlan(
-                f"procedure.stand_off: joint {joint} of '{arm.name}' is not within its limits by limit_margin_deg"
+                f"procedure.stand_off: joint {joint + 1} of '{arm.name}' is not within its limits by limit_margin_deg: "
+                f"it is at {np.rad2deg(q[joint]):.1f} deg, allowed are {low:.1f} to {high:.1f} deg"
             )
-    clearance = float(ways.geometry.clearance([posture.active], [posture.passive], belief.placement)[0])
-    if clearance < ways.margin:
+    geometry = ways.geometry
+    for arm, body, q in (
+        (model.active, geometry.active, posture.active),
+        (model.passive, geometry.passive, posture.passive),
+    ):
+        own = float(body.own_clearance([q])[0])
+        if own < ways.margin:
+            raise NoPlan(
+                f"procedure.stand_off: '{arm.name}' is only {own * 1e3:.0f} mm clear of "
+                f"{closest_own(body, np.array(q))}, {ways.margin * 1e3:.0f} mm are needed"
+            )
+    between = _between(ways, belief, posture)
+    if between < ways.margin:
         raise NoPlan(
-            f"procedure.stand_off: only {clearance * 1e3:.0f} mm are sure to be clear, {ways.margin * 1e3:.0f} mm are "
-            "needed whatever the error of the bases that nominal.uncertainty allows; move the arms farther apart there"
+            f"procedure.stand_off: only {between * 1e3:.0f} mm between the arms are sure to be clear, "
+            f"{ways.margin * 1e3:.0f} mm are needed whatever the error of the bases that nominal.uncertainty allows; "
+            "move the arms farther apart there"
         )
     if not model.in_view(_T_E_T(model, belief, posture)[None])[0]:
         raise NoPlan(
             "procedure.stand_off: the camera does not see the whole front of the target there, by the nominal "
             "transforms; let camera and target face each other"
+        )
+    if not in_sight(model, [posture.active], [posture.passive], belief)[0]:
+        raise NoPlan(
+            "procedure.stand_off: an arm or a fixture stands between the camera and the target there, by the nominal "
+            "transforms; choose one with a clear line of sight"
         )
 
 
@@ -254,16 +274,22 @@ def _facing_postures(
     toward = np.array([*other[:2] / apart, 0.0])
     middle = np.clip((apart - _GOOD_DISTANCE) / 2, _LEAST_FORWARD, _MOST_FORWARD)
     facing = np.stack([np.cross(-up, toward), -up, toward], axis=1)
-    tools = [
-        transform(facing @ rotation_from_vector([0.0, 0.0, roll]), (middle + forward) * toward + height * up)
-        for forward, height, roll in itertools.product(_FORWARD, _HEIGHT, _ROLLS)
-    ]
-    goals = np.array(tools) @ T_tool_flange
-    starts = np.concatenate(
-        [random_joints(rng, len(goals) * (_STARTS - 1), arm.lower, arm.upper), np.tile(arm.home, (len(goals), 1))]
-    )
-    q, reached = arm.chain.inverse(np.tile(goals, (_STARTS, 1, 1)), starts, arm.lower, arm.upper)
-    refused[f"'{arm.name}' does not get there"] += int(np.sum(~reached))
+    for farther in _FARTHER:
+        tools = [
+            transform(
+                facing @ rotation_from_vector([0.0, 0.0, roll]),
+                (middle + forward + farther) * toward + (height + farther) * up,
+            )
+            for forward, height, roll in itertools.product(_FORWARD, _HEIGHT, _ROLLS)
+        ]
+        goals = np.array(tools) @ T_tool_flange
+        starts = np.concatenate(
+            [random_joints(rng, len(goals) * (_STARTS - 1), arm.lower, arm.upper), np.tile(arm.home, (len(goals), 1))]
+        )
+        q, reached = arm.chain.inverse(np.tile(goals, (_STARTS, 1, 1)), starts, arm.lower, arm.upper)
+        refused[f"'{arm.name}' does not get there"] += int(np.sum(~reached))
+        if np.any(reached):
+            break
     q = arm.nearest_turn(q[reached], arm.home)
     _, different = np.unique(np.round(q, 3), axis=0, return_index=True)
     return np.asarray(q[np.sort(different)])
@@ -294,6 +320,8 @@ def _facing_pairs(model: CellModel, belief: Belief, seed: int, refused: Counter[
     T_E_T = inverse(model.camera_in_passive(q_a[first], belief)) @ model.target_in_passive(q_p[second])
     merit = merit_a[first] + merit_p[second] + 4 * np.minimum(between, STAND_OFF_CLEARANCE)
     merit = merit - np.abs(T_E_T[:, 2, 3] - _GOOD_DISTANCE)
+    # The camera is tilted alike to all sides in search of the board: it should stand in the middle.
+    merit = merit - 3 * np.linalg.norm(T_E_T[:, :2, 3], axis=1)
     seen, clear = model.in_view(T_E_T), between >= margin
     refused[_NOT_IN_VIEW] += int(np.sum(~seen))
     refused["the arms are too close to each other"] += int(np.sum(seen & ~clear))

@@ -21,9 +21,8 @@ from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.estimation.projection import project
 from procedures.planning.belief import Belief
 
-CAMERA_ERROR = 0.015
-"""m by which the camera's housing may stand off where the nominal hand-eye transform says: a centimetre, and six
-degrees about the lens."""
+CAMERA_ERROR = 0.010, np.deg2rad(6.0)
+"""m and rad, about the lens, by which the nominal hand-eye transform may be wrong as far as the camera's shape goes."""
 
 IMAGE_MARGIN = 20.0
 """The whole target stays this far (px) inside the image."""
@@ -129,8 +128,7 @@ class CellModel:
         self.stand_off = None if given is None else Posture.of(given.active, given.passive)
         self.nominal = Belief.nominal(cell.nominal)
         # Without looks the nominal transforms are all there is, and taken as exact.
-        camera_error = CAMERA_ERROR if cell.procedure.first_looks else 0.0
-        self.geometry = CellGeometry.of(cell, camera_error=camera_error)
+        self.geometry = CellGeometry.of(cell, camera_error=_camera_error(cell) if cell.procedure.first_looks else 0.0)
         self._T_H_E = self.nominal.T_H_E
         # The plate may not leave the image either: its margin helps nobody but the eye that looks for the corners.
         self._in_view = np.concatenate([self.board.corners, self.board.outline])
@@ -190,3 +188,9 @@ class CellModel:
         inside = np.all((pixels >= IMAGE_MARGIN) & (pixels <= size - 1 - IMAGE_MARGIN), axis=(-1, -2))
         facing = -np.einsum("...i,...i->...", T_E_T[..., :3, 2], T_E_T[..., :3, 3]) > 0
         return np.asarray(inside & facing)
+
+
+def _camera_error(cell: CellConfig) -> float:
+    """How far (m) the ends of the camera's capsule may be from where the nominal hand-eye transform has them."""
+    translation, rotation = CAMERA_ERROR
+    return float(translation + 2 * np.sin(rotation / 2) * (cell.camera.body_radius + cell.camera.body_length))

@@ -36,7 +36,8 @@ class View:
 def refine(model: CellModel, views: Sequence[View]) -> tuple[Belief, float]:
     """The belief that explains the views, and its rms in px per axis.
 
-    The error that it keeps clear of is the fit's, or the nominal placement's while that says more.
+    The error that it keeps clear of is the fit's, or the nominal placement's while that says more. ValueError if
+    nothing near the nominal explains them.
     """
     corners = np.stack([view.corners for view in views])
     # Only few views need starts of their own; with many the nominal has been left behind long ago.

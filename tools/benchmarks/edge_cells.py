@@ -1,4 +1,7 @@
-"""Random cells at the edge of the stated error: arms of public tables, bases wrong by all that the cell file allows."""
+"""Random cells at the edge of the stated error: arms of public tables, bases wrong by all that the cell file allows.
+
+Arms rest where somebody would have jogged them for this: clear of themselves, and of each other whatever that error.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,10 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 
+from dualcal_hal.config import CellDocument
+from dualcal_hal.geometry import BETWEEN_SAMPLES
 from dualcal_hal.transforms import Array, rotation_from_vector, transform, vector_from_rotation
+from procedures.planning.model import CellModel
 
 BASE_ERROR = 0.12, np.deg2rad(12.0)
 """m and rad; as ``nominal.uncertainty`` says."""
@@ -21,6 +27,8 @@ CAMERA_ERROR = 0.01, np.deg2rad(5.6)
 DISTANCES = 0.9, 1.5
 """m between the bases."""
 
+_HOMES_TRIED = 200
+_HOME_SPREAD = np.deg2rad([20.0, 20.0, 20.0, 60.0, 60.0, 60.0])
 _PAPERS_HOME = (0, 0, 100, 0, 30, 0)  # deg, drawn back so far that no error of the bases lets the arms touch
 _PAPER = Path(__file__).parents[2] / "cells" / "paper.yaml"
 
@@ -121,7 +129,23 @@ def edge_cell(number: int, *, stepper: str, arms: str | None = None) -> str:
         "active_base_in_passive_base": _written(nominal @ _error(rng, *BASE_ERROR)),
         "camera_in_active_flange": _written(camera @ _error(rng, *CAMERA_ERROR)),
     }
+    _choose_homes(cell, rng)
     return json.dumps(cell, indent=1)
+
+
+def _choose_homes(cell: dict[str, Any], rng: np.random.Generator) -> None:
+    """Homes near the tables', the first tried that a run could leave; the tables' own where none will do."""
+    config = CellDocument.model_validate(cell).cell
+    model = CellModel(config)
+    tables = [np.array(arm.home) for arm in (model.active, model.passive)]
+    spread = np.zeros(len(tables[0]))
+    for _ in range(_HOMES_TRIED):
+        q_a, q_p = (home + spread * rng.uniform(-1, 1, len(home)) for home in tables)
+        if model.geometry.clearance([q_a], [q_p], model.nominal.placement)[0] >= model.margin + BETWEEN_SAMPLES:
+            for name, q in ((config.active_name, q_a), (config.passive_name, q_p)):
+                cell["robots"][name]["home_deg"] = np.rad2deg(q).tolist()
+            return
+        spread = _HOME_SPREAD
 
 
 def _camera_beside_the_wrist(rng: np.random.Generator) -> Array:

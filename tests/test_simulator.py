@@ -24,7 +24,7 @@ from backends.simulator.trajectory import Trajectory
 from backends.simulator.world import World
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.clock import VirtualClock
-from dualcal_hal.errors import CellFileError, CommandRefused, DeviceError, MotionStopped
+from dualcal_hal.errors import CellFileError, CommandRefused, DeviceError, MotionStopped, NotOpen
 from dualcal_hal.registry import backend_class
 from dualcal_hal.robot import JointPath, Joints, Motion, MotionState, RobotState
 from dualcal_hal.transforms import Array
@@ -338,6 +338,18 @@ def test_after_opening_again_the_arms_are_at_home_and_time_has_gone_on(exact: Si
     exact.open(TIMEOUT)
     assert exact.robot(ACTIVE).read(TIMEOUT).positions == away(ACTIVE, 0.0)
     assert exact.clock.now() == before > 0.0
+
+
+@pytest.mark.parametrize("stepper", ["kinematic", "bullet"])
+def test_in_a_world_that_another_thread_has_closed_no_motion_begins(stepper: str) -> None:
+    file = cell(f"simulation.stepper={stepper}")
+    assert file.simulation is not None
+    world = World(file.cell, file.simulation, VirtualClock())
+    arm = world.arms[ACTIVE]
+    world.close()
+    with pytest.raises(NotOpen, match="left: move: it was closed meanwhile"):
+        arm.follow(JointPath((away(ACTIVE, 0.1),), (1.0,) * 6, (1.0,) * 6))
+    assert arm.target == away(ACTIVE, 0.0)
 
 
 # States and frames

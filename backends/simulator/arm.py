@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from backends.simulator.mechanics import Approach
-from dualcal_hal.errors import CommandRefused, Contact
+from dualcal_hal.errors import CommandRefused, Contact, NotOpen
 from dualcal_hal.robot import JointPath, Joints, Mode, Motion, RobotState, StopResult
 from dualcal_hal.transforms import Array
 
@@ -54,9 +54,14 @@ class SimulatedArm:
             return RobotState(tuple(positions.tolist()), tuple(velocities.tolist()), mode, faults, now, self._sequence)
 
     def follow(self, path: JointPath) -> Motion:
-        """Begin to follow a path that the arm can follow; CommandRefused if it is moving, off or at fault."""
+        """Begin to follow a path that the arm can follow; CommandRefused if it is moving, off or at fault.
+
+        NotOpen if its world has been closed: another thread may do so at any time before this one has the lock.
+        """
         self._finish(self._motion)
         with self._world.lock:
+            if self._world.closed.is_set():
+                raise NotOpen(self._name, "move", "it was closed meanwhile", "open its backend again")
             self._refuse_if_moving("move")
             self._refuse_if_faulty("move")
             if self._mode is not Mode.READY:

@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from backends.simulator import SimulatorBackend
-from backends.simulator.bullet.bodies import BulletBodies
+from backends.simulator.bullet.bodies import STEP, BulletBodies
 from backends.simulator.bullet.client import pybullet
 from backends.simulator.bullet.nearness import Nearness
-from backends.simulator.bullet.stepper import SETTLED
+from backends.simulator.bullet.stepper import SETTLED, BulletStepper
 from backends.simulator.trajectory import Trajectory
 from backends.simulator.truth import Truth
 from dualcal_hal.cellfile import CellFile, load_cell
@@ -30,7 +30,7 @@ from dualcal_hal.geometry import CellGeometry, Placement, segment_distance
 from dualcal_hal.kinematics import Chain, Row
 from dualcal_hal.robot import JointPath, Joints, Mode, Motion, RobotState
 from dualcal_hal.session.distances import Distances
-from dualcal_hal.transforms import Array, apply
+from dualcal_hal.transforms import Array, apply, inverse
 from tests.cells import NOISELESS, PAPER, SMALL
 from tools.cli.app import app
 
@@ -237,6 +237,28 @@ def test_a_motion_ends_when_the_joints_have_settled_not_when_their_set_points_re
     assert 0.01 < backend.clock.now() - trajectory.end < 0.1
 
 
+def test_a_path_back_to_where_it_began_is_followed_before_it_is_over(backend: SimulatorBackend) -> None:
+    """It begins so gently that after the first step the joints are all but at rest where the path ends."""
+    home = backend.cell.cell.active.home
+    away = home + 0.002
+    heard: list[RobotState] = []
+    backend.robot(ACTIVE).subscribe(heard.append)
+    there_and_back = JointPath((tuple(away.tolist()), tuple(home.tolist())), (1.0,) * 6, (0.01,) * 6)
+    backend.robot(ACTIVE).start(there_and_back).wait(TIMEOUT)
+    np.testing.assert_allclose(np.max([state.positions for state in heard], axis=0), away, rtol=0, atol=1e-4)
+
+
+def test_between_two_steps_joints_go_on(backend: SimulatorBackend) -> None:
+    robot, clock = backend.robot(ACTIVE), backend.clock
+    motion = start(backend, ACTIVE, degrees(60, 0, 60, 0, 30, 0))
+    times, turned = 0.4 + STEP * np.arange(0.0, 4.0, 0.125), []
+    for when in times:
+        clock.call_at(float(when), lambda: turned.append(robot.read(TIMEOUT).positions[0]))
+    motion.wait(TIMEOUT)
+    speed = np.diff(turned) / np.diff(times)
+    np.testing.assert_allclose(speed, backend.cell.cell.active.speed[0], rtol=0.1)
+
+
 def test_a_motion_that_does_not_settle_fails(backend: SimulatorBackend, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("backends.simulator.bullet.stepper.SETTLED", 0.0)
     with pytest.raises(MotionFailed, match="not settled 3 s after"):
@@ -280,6 +302,7 @@ def test_the_same_motions_are_the_same_bit_for_bit() -> None:
 
 # Contact
 
+HOME = degrees(0, 0, 60, 0, 30, 0)
 LEANING = degrees(0, -45, 45, 0, 0, 0)
 
 
@@ -312,9 +335,47 @@ def test_contact_is_found_before_parts_are_deep_in_each_other(backend: Simulator
 
 
 @pytest.mark.parametrize(
+    ("begin", "end", "other"),
+    [
+        (degrees(40, -45, 45, 0, 0, 0), degrees(-40, -45, 45, 0, 0, 0), LEANING),
+        (HOME, degrees(0, -70, 30, 0, 30, 0), HOME),
+        (HOME, degrees(0, 0, -80, 0, 0, 0), HOME),
+    ],
+    ids=["the other arm", "the floor", "itself"],
+)
+@pytest.mark.parametrize("angle", [0.01, 0.02, 0.03, 0.05])
+def test_contact_is_found_in_the_step_in_which_measuring_all_finds_it(
+    bodies: BulletBodies, begin: Joints, end: Joints, other: Joints, angle: float
+) -> None:
+    bodies.put(PASSIVE, np.array(other))
+    nearness, way = Nearness(bodies), np.subtract(end, begin)
+    turned = angle * np.abs(way) / np.abs(way).max()
+    for share in np.arange(0.0, 1.0, angle / np.abs(way).max()):
+        bodies.put(ACTIVE, begin + share * way)
+        touching = Nearness(bodies).contact({ACTIVE: turned})
+        assert nearness.contact({ACTIVE: turned}) == touching
+        if touching is not None:
+            return
+    pytest.fail("nothing touched")
+
+
+def test_a_fast_motion_halts_in_the_step_in_which_parts_touch() -> None:
+    stepper = BulletStepper(cell().cell, truth_of(cell()))
+    stepper.follow(ACTIVE, JointPath((degrees(0, -70, 30, 0, 30, 0),), (8.0,) * 6, (80.0,) * 6), 0.0)
+    steps = itertools.count(1)
+    while stepper.fault is None:
+        stepper.sample(ACTIVE, next(steps) * STEP)
+        touching = Nearness(stepper.scene).contact({ACTIVE: np.zeros(6)})
+        assert (stepper.fault is None) == (touching is None)
+    assert "touches floor" in stepper.fault
+    stepper.close()
+
+
+@pytest.mark.parametrize(
     ("target", "parts"),
     [
         (degrees(0, -70, 30, 0, 30, 0), "(link [56]|camera) of left touches floor"),
+        (degrees(0, -110, 125, 0, 30, 0), "link [23] of left touches floor"),
         (degrees(0, 0, -80, 0, 0, 0), "link [12] of left touches link [56] of left"),
     ],
 )
@@ -339,6 +400,43 @@ def test_an_arm_that_meets_a_fixture_halts(shape: str, tmp_path: Path) -> None:
     with pytest.raises(Contact, match="of right touches post"):
         move(backend, PASSIVE, (np.radians(90), *LEANING[1:]))
     runs.close()
+
+
+KNOBS = {"link 1": [0, 65, 136], "link 2": [0, 106, 280], "link 3": [0, 95, 640]}
+"""Where, in mm, the parts come by as the passive arm turns about its first axis."""
+
+
+def knob(part: str, base: str = "passive_base") -> str:
+    """A fixture of one of the bases in that part's way."""
+    T_base_P = inverse(truth_of(cell()).T_P_A) if base == "active_base" else np.eye(4)
+    (at,) = 1e3 * apply(T_base_P, 1e-3 * np.array([KNOBS[part]]))
+    place = f"{{translation_mm: {at.tolist()}, rotation_vector_deg: [0, 0, 0]}}"
+    return f"fixtures={{knob: {{in: {base}, at: {place}, cylinder_mm: {{radius: 5, length: 10}}}}}}"
+
+
+@pytest.mark.parametrize(
+    ("part", "base"),
+    [
+        ("link 1", "passive_base"),
+        ("link 2", "passive_base"),
+        ("link 3", "passive_base"),
+        ("link 2", "active_base"),
+        ("link 3", "active_base"),
+    ],
+)
+def test_every_part_that_moves_is_held_against_the_fixtures(part: str, base: str) -> None:
+    for backend in opened(cell(knob(part, base))):
+        with pytest.raises(Contact, match=f"{part} of right touches knob"):
+            move(backend, PASSIVE, degrees(80, 0, 60, 0, 30, 0))
+
+
+def test_the_shoulder_is_held_against_the_fixtures_of_its_own_base_alone() -> None:
+    turned = degrees(45, 0, 60, 0, 30, 0)
+    for backend in opened(cell(knob("link 1", "active_base"))):
+        move(backend, PASSIVE, turned)
+    for backend in opened(cell(knob("link 1", "passive_base"))):
+        with pytest.raises(Contact):
+            move(backend, PASSIVE, turned)
 
 
 def a_ball(path: Path, rings: int, radius: float) -> str:
@@ -405,9 +503,10 @@ def test_a_world_that_cannot_be_finished_is_given_up(part: str, monkeypatch: pyt
 def test_a_cell_whose_arms_touch_at_home_does_not_open() -> None:
     home = "[0, -45, 45, 0, 0, 0]"
     backend = SimulatorBackend("sim", cell(f"robots.left.home_deg={home}", f"robots.right.home_deg={home}"))
-    with pytest.raises(Contact, match=r"left touches .* of right"):
+    before = worlds()
+    with pytest.raises(Contact, match=r"^sim: open: .* of left touches .* of right; check home_deg"):
         backend.open(TIMEOUT)
-    backend.close()
+    assert worlds() == before
 
 
 # Distances

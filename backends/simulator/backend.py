@@ -16,7 +16,7 @@ from backends.simulator.stepper import stepper_class
 from backends.simulator.world import World
 from dualcal_hal.backend import Backend
 from dualcal_hal.clock import VirtualClock
-from dualcal_hal.errors import CellFileError, NotOpen, Problem, UnknownDevice, UsageError
+from dualcal_hal.errors import CellFileError, Contact, NotOpen, Problem, UnknownDevice, UsageError
 
 if TYPE_CHECKING:
     from dualcal_hal.cellfile import CellFile
@@ -64,6 +64,8 @@ class SimulatorBackend(Backend):
         world = World(cell, simulation, self._clock)
         with ExitStack() as if_it_fails:
             if_it_fails.callback(world.close)
+            if world.stepper.fault is not None:
+                raise Contact(self.name, "open", world.stepper.fault, "check home_deg and the bases in the cell file")
             bodies = world.stepper.scene
             self._open = Sight(world, renderer, None if bodies is None else Scene(bodies, cell, renderer.rays))
             if_it_fails.pop_all()

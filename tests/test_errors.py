@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from backends.simulator.mechanics import Approach
+from backends.simulator.mechanics import Approach, Weight
 from backends.simulator.truth import Truth
 from backends.simulator.world import World
 from dualcal_hal.cell import Cell
@@ -24,7 +24,7 @@ from dualcal_hal.config.errors import ErrorsConfig
 from dualcal_hal.config.simulation import NoiseConfig
 from dualcal_hal.errors import CellFileError
 from dualcal_hal.guard import STANDSTILL
-from dualcal_hal.kinematics import Chain, random_joints
+from dualcal_hal.kinematics import Chain, Row, random_joints
 from dualcal_hal.robot import JointPath, RobotState
 from dualcal_hal.session.captures import Captures, read_captures
 from dualcal_hal.transforms import Array, inverse, rotation_angle
@@ -165,6 +165,18 @@ def test_with_backlash_a_link_lags_by_half_the_gap_and_waits_until_the_gap_is_cr
     assert lag(0.5, -0.3e-3) == pytest.approx(-1e-4)
 
 
+def test_with_backlash_a_path_is_followed_through_all_its_waypoints() -> None:
+    """Half of the gap's way is left after the last one: only the first shows on which side the gears lay before."""
+    cell, simulation = paper_cell({"backlash": {"gap_mrad": 0.2}})
+    quiet = {"stepper": "kinematic", "noise": NoiseConfig(joint_mrad=0, encoder_mrad=0)}
+    clock = VirtualClock()
+    arm = World(cell, simulation.model_copy(update=quiet), clock).arms[ACTIVE]
+    home = np.array(arm.target)
+    waypoints = tuple(tuple((home + offset).tolist()) for offset in (0.5, 0.5 - 0.05e-3))
+    read = arm.follow(JointPath(waypoints, (1.0,) * 6, (2.0,) * 6)).wait(30.0).positions
+    np.testing.assert_allclose(read - arm.true_positions(clock.now()), 0.5e-4, rtol=0, atol=1e-9)
+
+
 def test_sagging_joints_leave_the_mismatch_of_the_method() -> None:
     assert within_a_factor_of_two(figures({"compliance": {"sag_mrad": 1}}).corners, 0.27)
 
@@ -180,6 +192,17 @@ def test_joints_give_way_downwards_and_the_shoulder_most_with_the_arm_stretched_
         assert lower.sum() > 0
     level = np.radians([0, 85, 60, 0, 120, 0])
     assert abs((links(sagging, ACTIVE, level) - level)[1]) > 0.85e-3
+
+
+@pytest.mark.parametrize("radii", [(0.05, 0.05), (0.08, 0.04), (0.04, 0.08)])
+def test_links_weigh_by_their_volume(radii: tuple[float, float]) -> None:
+    """A level arm of an upper arm and a forearm of one length: the shoulder carries both, the elbow one."""
+    length = 0.4
+    rows = [Row(theta=0, d=0, a=0, alpha=np.pi / 2)] + [Row(theta=0, d=0, a=length, alpha=0)] * 2
+    upper_arm, forearm = (np.pi * r**2 * (length + 4 / 3 * r) for r in radii)
+    _, shoulder, elbow = Weight(Chain(tuple(rows)), np.array([0.05, *radii])).torque(np.zeros(3))
+    expected = forearm / 2 / (upper_arm / 2 + forearm * 3 / 2)
+    assert elbow / shoulder == pytest.approx(expected)
 
 
 def test_a_common_scale_of_both_arms_cannot_be_seen_though_the_bases_are_off_by_it() -> None:

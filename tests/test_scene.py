@@ -18,6 +18,7 @@ from backends.simulator.scene import FLOOR, SKY, Scene
 from backends.simulator.truth import Truth
 from dualcal_hal.camera import Intrinsics
 from dualcal_hal.cellfile import load_cell
+from dualcal_hal.config import CellConfig
 from dualcal_hal.transforms import Array, Mask, inverse, quaternion_from_rotation, rotation_from_vector, transform
 from tests.cells import NOISELESS, PAPER
 from tests.reference_cell import DOCUMENT
@@ -79,9 +80,9 @@ def cell(renderer: Renderer) -> Iterator[Cell]:
     yield from built(Truth(CELL.cell, CELL.simulation), renderer)
 
 
-def built(truth: Truth, renderer: Renderer) -> Iterator[Cell]:
-    bodies = BulletBodies(CELL.cell, truth)
-    yield Cell(bodies, truth, renderer, Scene(bodies, CELL.cell, renderer.rays))
+def built(truth: Truth, renderer: Renderer, config: CellConfig = CELL.cell) -> Iterator[Cell]:
+    bodies = BulletBodies(config, truth)
+    yield Cell(bodies, truth, renderer, Scene(bodies, config, renderer.rays))
     bodies.close()
 
 
@@ -105,9 +106,24 @@ def square(side: float) -> Array:
 # Before the target
 
 
-@pytest.mark.parametrize("capture", [0, 3, 6, 9, 21, 24, 27])
+@pytest.mark.parametrize("capture", [0, 3, 6, 9, 21, 24, 25, 27])
 def test_the_round_ends_of_the_links_that_carry_the_target_do_not_hide_it(cell: Cell, capture: int) -> None:
     assert cell.scene.view(cell.stand(capture)).hidden is None
+
+
+@pytest.mark.parametrize("boom_mm", [80, 150])
+def test_farther_before_a_target_they_do_hide_it(renderer: Renderer, boom_mm: float) -> None:
+    """It faces its own wrist from the end of a boom; a radius of 45 mm nearer, the wrist is before it."""
+    mount = f"{{translation_mm: [0, 0, {boom_mm}], rotation_vector_deg: [180, 0, 0]}}"
+    file = load_cell(PAPER, ("simulation.stepper=bullet", f"robots.right.target_mount={mount}"))
+    assert file.simulation is not None
+    truth = Truth(file.cell, file.simulation)
+    home = {name: truth.chains[name].forward(robot.home) for name, robot in file.cell.robots.items()}
+    T_T_E = transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.45])
+    truth.T_H_E = inverse(truth.T_P_A @ home[ACTIVE]) @ home[PASSIVE] @ truth.T_F_T @ T_T_E
+    for cell in built(truth, renderer, file.cell):
+        share = hidden(cell, inverse(T_T_E))[within(TARGET.plate_outline, inverse(T_T_E))]
+        assert share.mean() > 0.5
 
 
 def test_the_floor_of_one_arm_hides_nothing_of_the_other_however_wrong_the_bases_stand(renderer: Renderer) -> None:

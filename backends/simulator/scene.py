@@ -28,6 +28,10 @@ NEAREST, FARTHEST = 0.01, 20.0
 SKY, FLOOR = 110, 80
 """Grey values where there is nothing, and of infinite planes."""
 
+ROUND_END = 2.0
+"""Link radii along the line of sight by which the last two links of the arm that carries the target may stand before
+it without hiding it: they are behind it, though their capsules' round ends stick out."""
+
 _IN_FRONT = 0.003  # m before the target's plane hides it: less is the picture's depth resolution
 _SOFTNESS = 0.6  # sigma of the blur, px of the reduced picture
 _FILL = 4.0  # the same for what is filled in behind the plate
@@ -145,18 +149,18 @@ class Scene:
         self._camera = bodies.tool(cell.active_name)
         self._frustum = Frustum.around(rays)
         self._rays = self._frustum.rays
+        self._ray_lengths = np.sqrt(1.0 + np.sum(self._rays**2, axis=-1))  # m a metre of depth
         pixels = (rays * self._frustum.focal + self._frustum.principal_point).astype(np.float32)
         self._maps = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
         body, plate = bodies.tool(cell.passive_name)
         self._plate = part_code((body, plate))
         self._plate_radius = float(np.linalg.norm(cell.target.plate_outline, axis=1).max())
-        # The last two links carry the plate: they are behind it, though their capsules' round ends stick out.
-        carrying = bodies.shapes[cell.passive_name].capsules.frame >= cell.passive.chain.joints - 1
-        links = np.array(bodies.links[cell.passive_name])[carrying]
-        self._never_before = [part_code((body, int(link))) for link in links]
         # Each arm has a floor under its own base: where the bases stand unlike it passes through the other arm.
         self._floors = [part_code((body, -1)) for body in bodies.floors]
-        self._never_before += self._floors
+        self._spared = dict.fromkeys([self._plate, *self._floors], np.inf)
+        links, numbers = bodies.shapes[cell.passive_name].links, bodies.links[cell.passive_name]
+        for i in np.flatnonzero(links.frame >= cell.passive.chain.joints - 1).tolist():
+            self._spared[part_code((body, numbers[i]))] = ROUND_END * float(links.radius[i])
 
     def view(self, T_E_T: Array) -> View:
         """As things stand, with the target at ``T_E_T`` (4, 4)."""
@@ -167,9 +171,17 @@ class Scene:
         grey = picture.grey
         if inverse(T_E_T)[2, 3] > 0:
             grey = _filled_in(grey, picture.part == self._plate)
-        hidden = (picture.depth < self._plate_depth(T_E_T) - _IN_FRONT) & ~np.isin(picture.part, self._never_before)
+        hidden = self._hidden(picture, T_E_T)
         share = self._enlarged(255 * hidden.astype(np.uint8)) / np.float32(255) if hidden.any() else None
         return View(self._enlarged(grey), share)
+
+    def _hidden(self, picture: Picture, T_E_T: Array) -> Mask:
+        """Where (height, width) something is seen that stands before the plate."""
+        before = self._plate_depth(T_E_T) - picture.depth
+        hidden = before > _IN_FRONT
+        for part, spared in self._spared.items():
+            hidden &= (picture.part != part) | (before * self._ray_lengths > spared)
+        return np.asarray(hidden)
 
     def _lay(self, picture: Picture, body: int, T_E_plane: Array) -> None:
         """Draw an infinite plane z = 0 whose front is seen where nothing else is nearer; a floor behind all else."""

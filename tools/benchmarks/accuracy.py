@@ -1,4 +1,4 @@
-"""Accuracy and alignment over seeds: whole runs on the simulator.
+"""Accuracy and alignment over seeds: whole runs on the simulator. A seed without a result is told with its reason.
 
 python -m tools.benchmarks.accuracy cells/paper.yaml --seeds 20 [--set PATH=VALUE]...
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 
 from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import load_cell
+from dualcal_hal.errors import DegenerateCaptures, DeviceError, NoPlan
 from dualcal_hal.session.folder import Session
 from procedures.calibrate import Calibration, captures_of
 from procedures.events import PointDone
@@ -39,8 +41,24 @@ class Run:
     verdict: str
 
 
+@dataclass(frozen=True)
+class Ended:
+    """A seed that came to no result, and why."""
+
+    seed: int
+    why: str
+
+
+def attempt(path: Path, seed: int, overrides: list[str]) -> Run | Ended:
+    """As :func:`run`; a refusal to plan, a failed device and captures that determine too little are an outcome too."""
+    try:
+        return run(path, seed, overrides)
+    except (NoPlan, DegenerateCaptures, DeviceError) as error:
+        return Ended(seed, f"{type(error).__name__}: {' '.join(str(error).split())}")
+
+
 def run(path: Path, seed: int, overrides: list[str]) -> Run:
-    """A whole run with both seeds set, in a folder that is thrown away."""
+    """A whole run with both seeds set, in a folder that is thrown away; DegenerateCaptures if nothing verifies it."""
     file = load_cell(path, [*overrides, f"procedure.seed={seed}", f"simulation.seed={seed}"])
     points: list[PointDone] = []
 
@@ -53,8 +71,9 @@ def run(path: Path, seed: int, overrides: list[str]) -> Run:
         execute(Cell(file), Calibration(file.cell, CellModel(file.cell)), session, collect)
         result = conclude(file, session, captures_of(session.journal, file.sha256, None))
     constraints = list(dict.fromkeys(point.constraint for point in points))
-    assert result.truth_error is not None
-    assert result.mismatch_after is not None
+    if result.mismatch_after is None:
+        raise DegenerateCaptures("; ".join(result.reasons))
+    assert result.truth_error is not None  # the cell is simulated
     return Run(
         seed,
         result.mismatch_after.mean * 1e3,
@@ -74,27 +93,43 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE")
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
+    load_cell(options.cell, options.set)  # what is wrong with these is no seed's outcome
     seeds = range(1, options.seeds + 1)
     print("seed  mismatch mean mm  T_P_A deg  T_P_A mm  frames mean  p95  given up  verdict")
-    runs = []
+    outcomes = []
     with ProcessPoolExecutor(options.processes) as pool:
-        for one in pool.map(run, [options.cell] * len(seeds), seeds, [options.set] * len(seeds)):
-            runs.append(one)
-            print(
-                f"{one.seed:4d}  {one.mismatch:16.4f}  {one.rotation:9.4f}  {one.translation:8.3f}"
-                f"  {np.mean(one.frames):11.2f}  {np.percentile(one.frames, 95):3.0f}"
-                f"  {one.given_up:8d}  {one.verdict}",
-                flush=True,
-            )
+        for one in pool.map(attempt, [options.cell] * len(seeds), seeds, [options.set] * len(seeds)):
+            outcomes.append(one)
+            print(row(one), flush=True)
+    print(summary(outcomes))
+
+
+def row(one: Run | Ended) -> str:
+    """One seed's line of the table."""
+    if isinstance(one, Ended):
+        return f"{one.seed:4d}  {one.why}"
+    return (
+        f"{one.seed:4d}  {one.mismatch:16.4f}  {one.rotation:9.4f}  {one.translation:8.3f}"
+        f"  {np.mean(one.frames):11.2f}  {np.percentile(one.frames, 95):3.0f}"
+        f"  {one.given_up:8d}  {one.verdict}"
+    )
+
+
+def summary(outcomes: Sequence[Run | Ended]) -> str:
+    """The figures over the seeds that came to a result, and how many did not."""
+    runs = [one for one in outcomes if isinstance(one, Run)]
+    without = f"without a result {len(outcomes) - len(runs)} of {len(outcomes)} seeds"
+    if not runs:
+        return without
     frames = np.concatenate([one.frames for one in runs])
     later = np.concatenate([one.later_frames for one in runs])
     mismatch, rotation, translation = np.array([(one.mismatch, one.rotation, one.translation) for one in runs]).T
-    print(
+    return (
         f"mismatch: mean {mismatch.mean():.4f}, max {mismatch.max():.4f} mm; T_P_A: rms {_rms(rotation):.4f}, max "
         f"{rotation.max():.4f} deg, rms {_rms(translation):.3f}, max {translation.max():.3f} mm; frames a point: mean "
         f"{frames.mean():.2f}, p95 {np.percentile(frames, 95):.0f}, max {frames.max()}, "
         f"from the fourth constraint on {later.mean():.2f}; "
-        f"given up {sum(one.given_up for one in runs)} of {len(frames)} points"
+        f"given up {sum(one.given_up for one in runs)} of {len(frames)} points; {without}"
     )
 
 

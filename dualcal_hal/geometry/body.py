@@ -72,11 +72,14 @@ class ArmBody:
         """
         return self.own_clearance_at(self.segments(np.atleast_2d(np.asarray(q, dtype=float))))
 
-    def own_clearance_at(self, segments: Array) -> Array:
-        """The same, (k,) in m, with the capsules' ends at (k, c, 2, 3) in the arm's base."""
-        return np.asarray(self.own_clearances_at(segments).min(axis=0))
+    def own_clearance_at(self, segments: Array, enough: float = np.inf) -> Array:
+        """The same, (k,) in m, with the capsules' ends at (k, c, 2, 3) in the arm's base.
 
-    def own_clearances_at(self, segments: Array) -> Array:
+        More than ``enough`` (m) may be said to be less, but not than that: it is quicker.
+        """
+        return np.asarray(self.own_clearances_at(segments, enough).min(axis=0))
+
+    def own_clearances_at(self, segments: Array, enough: float = np.inf) -> Array:
         """The same, (2 + fixtures, k): to itself, to the floor, to each of the fixtures of its base."""
         radius = self.capsules.radius
         clearances = np.full((2 + len(self.fixtures), len(segments)), np.inf)
@@ -86,7 +89,8 @@ class ArmBody:
             heights = segments[..., 2][:, self.above_floor].min(axis=2) - radius[self.above_floor]
             clearances[1] = heights.min(axis=1) - self.floor
         for number, fixture in enumerate(self.fixtures, start=2):
-            clearances[number] = (fixture.separation(segments[:, self.moving]) - radius[self.moving]).min(axis=1)
+            distance = fixture.separation(segments[:, self.moving], enough + radius[self.moving])
+            clearances[number] = (distance - radius[self.moving]).min(axis=1)
         return clearances
 
     def without(self, fixture: str) -> ArmBody:

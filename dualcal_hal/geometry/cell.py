@@ -58,8 +58,11 @@ class CellGeometry:
         passive = self.passive.segments(np.atleast_2d(np.asarray(q_p, dtype=float)))
         return self.between_at(active, passive, placement)
 
-    def between_at(self, active: Array, passive: Array, placement: Placement) -> Array:
-        """The same, (k,) in m, with the capsules' ends at (k or 1, c, 2, 3), those of each arm in its base."""
+    def between_at(self, active: Array, passive: Array, placement: Placement, enough: float = np.inf) -> Array:
+        """The same, (k,) in m, with the capsules' ends at (k or 1, c, 2, 3), those of each arm in its base.
+
+        More than ``enough`` (m) may be said to be less, but not than that: it is quicker.
+        """
         T_A_P = inverse(placement.T_P_A)
         passive = apply(T_A_P, passive.reshape(-1, 3)).reshape(passive.shape)
         least = self._between_arms(active, passive, placement)
@@ -67,12 +70,12 @@ class CellGeometry:
             (self.passive, T_A_P, self.active, active),
             (self.active, np.eye(4), self.passive, passive),
         ):
-            near = body.above_floor
+            near, radius = body.above_floor, body.capsules.radius[body.above_floor]
             for fixture in standing.fixtures:
                 distance = fixture.separation_from_afar(
-                    T_A_base, segments[:, near], placement.translation, placement.rotation
+                    T_A_base, segments[:, near], placement.translation, placement.rotation, enough + radius
                 )
-                least = np.minimum(least, (distance - body.capsules.radius[near]).min(axis=1))
+                least = np.minimum(least, (distance - radius).min(axis=1))
         return least
 
     def clearance(self, q_a: ArrayLike, q_p: ArrayLike, placement: Placement) -> Array:

@@ -39,6 +39,9 @@ class Mesh(Solid):
         moved = largest_motion(segments - pivot, translation, rotation).max(axis=-1)
         return np.asarray(self._grid.distance(points).min(axis=-1) - longest / (count - 1) / 2 - moved)
 
+    def away(self, points: Array) -> Array:
+        return self._grid.distance(points)
+
     @cached_property
     def _grid(self) -> _Grid:
         return _Grid.about(self.corners)

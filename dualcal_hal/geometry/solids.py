@@ -6,9 +6,10 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from dualcal_hal.geometry.distance import dot, unit
-from dualcal_hal.geometry.placement import farthest_along
+from dualcal_hal.geometry.distance import dot, length, unit
+from dualcal_hal.geometry.placement import farthest_along, largest_motion
 from dualcal_hal.transforms import Array, apply, inverse
 
 _BISECTIONS = 16
@@ -24,6 +25,10 @@ class Solid(ABC):
         Whatever the error of the segments' place within ``translation`` (m) and ``rotation`` (rad) about ``pivot``
         (3,). Not above zero where they may touch.
         """
+
+    @abstractmethod
+    def away(self, points: Array) -> Array:
+        """Distance (...) in m of points (..., 3) from the solid, or less."""
 
 
 class Convex(Solid):
@@ -41,6 +46,9 @@ class Convex(Solid):
         n = unit(self._gap(segments))
         moving = farthest_along(n[..., None, :], segments - pivot, rotation).max(axis=-1) + dot(n, pivot)
         return np.asarray(self.lowest_along(n) - moving - translation)
+
+    def away(self, points: Array) -> Array:
+        return length(points - self.nearest(points))
 
     def _gap(self, segments: Array) -> Array:
         """Vector (..., 3) to the solid from the closest point of a segment, by bisection: the distance is convex."""
@@ -104,15 +112,29 @@ class Fixture:
     solid: Solid
     T: Array
 
-    def separation(self, segments: Array) -> Array:
-        """Least distance (k, c) in m from segments (k, c, 2, 3) in the fixture's base."""
-        return self._separation(self.T, segments, 0.0, 0.0)
+    def separation(self, segments: Array, enough: ArrayLike = np.inf) -> Array:
+        """Least distance (k, c) in m from segments (k, c, 2, 3) in the fixture's base.
 
-    def separation_from_afar(self, T_X_base: Array, segments: Array, translation: float, rotation: float) -> Array:
+        What is farther than ``enough``, (c,) or one, may be said to be nearer, but not than that: it is quicker.
+        """
+        return self._separation(self.T, segments, 0.0, 0.0, enough)
+
+    def separation_from_afar(
+        self, T_X_base: Array, segments: Array, translation: float, rotation: float, enough: ArrayLike = np.inf
+    ) -> Array:
         """The same from segments (k, c, 2, 3) in frame X, whatever the error of X, or of the base, about X's origin."""
-        return self._separation(T_X_base @ self.T, segments, translation, rotation)
+        return self._separation(T_X_base @ self.T, segments, translation, rotation, enough)
 
-    def _separation(self, T: Array, segments: Array, translation: float, rotation: float) -> Array:
+    def _separation(self, T: Array, segments: Array, translation: float, rotation: float, enough: ArrayLike) -> Array:
         T_solid = inverse(T)
+        pivot = T_solid[:3, 3]
         placed = apply(T_solid, segments.reshape(-1, 3)).reshape(segments.shape)
-        return self.solid.separation(placed, T_solid[:3, 3], translation, rotation)
+        if np.all(np.isinf(enough)):
+            return self.solid.separation(placed, pivot, translation, rotation)
+        half = length(placed[..., 1, :] - placed[..., 0, :]) / 2
+        moved = largest_motion(placed - pivot, translation, rotation).max(axis=-1)
+        separation = self.solid.away(placed.mean(axis=-2)) - half - moved
+        near = separation < enough
+        if np.any(near):
+            separation[near] = self.solid.separation(placed[near], pivot, translation, rotation)
+        return np.asarray(separation)

@@ -53,18 +53,19 @@ class Mover:
         """Joint waypoints (w, n) to the joint angles (k, n) that are checked."""
         return self._body.sampled(waypoints)
 
-    def clearances(self, q: Array, point: Array) -> Array:
+    def clearances(self, q: Array, point: Array, enough: float = np.inf) -> Array:
         """Least clearance at joint angles (k, n), whatever the bases' error; the other arm stands as in the point.
 
         (2, k) in m: to the other arm and what stands about its base, and to the floor, its own fixtures and itself.
+        More than ``enough`` may be said to be less, but not than that: it is quicker.
         """
         segments = self._body.segments(q)
-        own = self._body.own_clearance_at(segments)
+        own = self._body.own_clearance_at(segments, enough)
         if self.is_alone:
             return np.stack([np.full(len(q), np.inf), own])
         standing = self._standing_body.segments(point[None, self.standing_axes])
         both = (segments, standing) if self.is_active else (standing, segments)
-        return np.stack([self.geometry.between_at(*both, self.placement), own])
+        return np.stack([self.geometry.between_at(*both, self.placement, enough), own])
 
     def free_samples(self, samples: Array, point: Array) -> int:
         """How many of the samples (k, n) of a move can be passed from its first on.
@@ -74,7 +75,7 @@ class Mover:
         """
         free = len(samples)
         for stride in (_COARSE, 1):
-            clearances = self.clearances(samples[:free:stride], point)
+            clearances = self.clearances(samples[:free:stride], point, self.margin)
             if clearances[0, 0] < self._least_to_leave:
                 return 0
             allowed = np.minimum(self.margin, np.maximum.accumulate(clearances, axis=1)) - _ROUNDING

@@ -84,6 +84,17 @@ def test_the_distance_to_a_mesh_is_never_more_than_the_true_one_and_less_by_23_m
     assert distance >= min(exact, 1.0) - MESH_ACCURACY
 
 
+@pytest.mark.parametrize("kind", [*SOLIDS, "mesh"])
+@settings(max_examples=100, deadline=None)
+@given(pair=arrays(float, (2, 2, 3), elements=st.floats(-1, 1)), enough=st.floats(0, 0.5), error=st.floats(0, 0.2))
+def test_what_is_farther_than_enough_may_be_said_to_be_nearer_but_not_than_that(kind, pair, enough, error):
+    fixture = Fixture("it", MESH if kind == "mesh" else SOLIDS[kind][0], T_BASE_SOLID)
+    pair = pair + np.array([[0.0], [0.4], [0.8]])[..., None, None]
+    told = fixture.separation_from_afar(np.eye(4), pair, error, error)
+    quick = fixture.separation_from_afar(np.eye(4), pair, error, error, [enough, enough + 0.1])
+    assert np.all((quick == told) | ((quick >= [enough, enough + 0.1]) & (told >= [enough, enough + 0.1])))
+
+
 def test_a_tip_of_a_mesh_does_not_slip_between_the_points_of_a_segment():
     tip = Fixture("spike", Mesh(np.array([[[0.0, 0.0, 0.0], [0.001, 0.0, -0.3], [0.0, 0.001, -0.3]]])), np.eye(4))
     starts = np.linspace(-0.2, 0.0, 101)

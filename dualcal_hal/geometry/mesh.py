@@ -40,7 +40,8 @@ class Mesh(Solid):
         return np.asarray(self._grid.distance(points).min(axis=-1) - longest / (count - 1) / 2 - moved)
 
     def away(self, points: Array) -> Array:
-        return self._grid.distance(points)
+        # Not more than what is told of a segment through them.
+        return np.asarray(self._grid.distance(points) - 2.5 * self._grid.voxel - _SPACING / 2)
 
     @cached_property
     def _grid(self) -> _Grid:

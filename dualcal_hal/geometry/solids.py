@@ -134,7 +134,8 @@ class Fixture:
         half = length(placed[..., 1, :] - placed[..., 0, :]) / 2
         moved = largest_motion(placed - pivot, translation, rotation).max(axis=-1)
         separation = self.solid.away(placed.mean(axis=-2)) - half - moved
-        near = separation < enough
+        # All segments of a posture or none: how a mesh is looked up depends on the longest of them.
+        near = np.any(separation < enough, axis=-1)
         if np.any(near):
             separation[near] = self.solid.separation(placed[near], pivot, translation, rotation)
         return np.asarray(separation)

@@ -190,12 +190,13 @@ def test_of_the_stand_offs_compared_the_one_is_taken_from_which_most_looks_can_f
 
 def test_a_stand_off_that_is_too_close_in_the_true_shapes_is_not_taken(model, ways, stand_off, monkeypatch):
     """As if the shape of something were not inside its capsules where both arms stand best."""
-    exact = ExactCell.clearance
+    exact = ExactCell.clearances
 
     def narrower(self, q_a, q_p, T_P_A):
-        return 0.019 if Posture.of(q_a, q_p) == stand_off.posture else exact(self, q_a, q_p, T_P_A)
+        clearances = exact(self, q_a, q_p, T_P_A)
+        return np.full_like(clearances, 0.019) if Posture.of(q_a, q_p) == stand_off.posture else clearances
 
-    monkeypatch.setattr(ExactCell, "clearance", narrower)
+    monkeypatch.setattr(ExactCell, "clearances", narrower)
     assert find_stand_off(model, model.nominal, ways, model.home, 1).posture != stand_off.posture
 
 
@@ -247,6 +248,13 @@ def test_looks_show_the_whole_board_and_are_clear_whatever_the_error(model, ways
         assert least_clearance(model, postures, model.nominal.placement) >= model.margin
         for posture in postures:
             assert model.in_view(seen_from_camera(model, posture, model.nominal)[None])[0]
+
+
+def test_no_look_is_taken_where_the_board_would_not_be_wholly_in_view(model, ways, stand_off, monkeypatch):
+    monkeypatch.setattr(CellModel, "in_view", lambda self, T_E_T: np.zeros(len(T_E_T), dtype=bool))
+    refused = Counter()
+    assert list(look_postures(model, model.nominal, ways, stand_off.posture, 1, refused)) == []
+    assert refused["the target is not wholly in view"] >= 1
 
 
 def test_where_the_board_is_not_seen_the_camera_is_tilted_in_two_rings_and_the_passive_arm_stays(

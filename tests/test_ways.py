@@ -205,9 +205,19 @@ def test_a_goal_behind_walls_without_a_gap_is_given_up(model):
     assert ways.find(one, other) is None
 
 
+def test_a_way_that_was_searched_for_is_shortened(model, blocked, monkeypatch):
+    ways = finder(model, FITTED)
+    shortened = [ways.travel(start, ways.find(start, goal)) for start, goal in blocked]
+    monkeypatch.setattr("procedures.planning.search.SHORTCUTS", 0)
+    found = [ways.travel(start, ways.find(start, goal)) for start, goal in blocked]
+    assert all(short <= long for short, long in zip(shortened, found, strict=True))
+    assert sum(shortened) < 0.95 * sum(found)
+
+
 def test_retreats_are_tried_before_anything_random(model, monkeypatch):
     """No random point, and no shortcut past a retreat, is tried here at all."""
     monkeypatch.setattr("procedures.planning.search.ITERATIONS", 0)
+    monkeypatch.setattr("procedures.planning.search.ALONE_ITERATIONS", 0)
     monkeypatch.setattr("procedures.planning.search.SHORTCUTS", 0)
     placed = replace(model.nominal, placement=Placement(model.nominal.T_P_A, *FITTED))
     _, queries = blocked_queries(model, FITTED, 4, 1)
@@ -224,12 +234,13 @@ def test_retreats_are_tried_before_anything_random(model, monkeypatch):
 
 def as_if_truly_close(monkeypatch, where, clearance=CLEARANCE - 0.001):
     """As if the shape of something were not inside its capsules, at postures for which ``where`` holds."""
-    exact = ExactCell.clearance
+    exact = ExactCell.clearances
 
     def narrower(self, q_a, q_p, T_P_A):
-        return clearance if where(Posture.of(q_a, q_p)) else exact(self, q_a, q_p, T_P_A)
+        clearances = exact(self, q_a, q_p, T_P_A)
+        return np.full_like(clearances, clearance) if where(Posture.of(q_a, q_p)) else clearances
 
-    monkeypatch.setattr(ExactCell, "clearance", narrower)
+    monkeypatch.setattr(ExactCell, "clearances", narrower)
 
 
 def standing(model, start, way):
@@ -264,6 +275,23 @@ def test_who_stands_too_close_in_the_true_shapes_may_leave_and_only_from_there(m
     as_if_truly_close(monkeypatch, lambda posture: posture != goal)
     assert ways.find(model.home, goal) is not None
     assert ways.find(goal, model.home) is None
+
+
+@pytest.mark.parametrize(("at_first", "there", "may"), [(0, 0, True), (0, 1, False), (1, 0, False), (1, 1, True)])
+def test_two_parts_that_stand_too_close_in_the_true_shapes_excuse_no_other_two(
+    model, monkeypatch, at_first, there, may
+):
+    goal = Posture.of(np.array(model.home.active) + 0.3, np.array(model.home.passive) - 0.3)
+
+    def two(self, q_a, q_p, T_P_A):
+        clearances = np.full(2, 0.1)
+        clearances[at_first if Posture.of(q_a, q_p) == model.home else there] = 0.005
+        return clearances
+
+    monkeypatch.setattr(ExactCell, "clearances", two)
+    ways = finder(model, apart=2.0)
+    assert (ways.find(model.home, goal) is not None) == may
+    assert ("to themselves" in ways.blocked_by(model.home, goal)) != may
 
 
 # -- determinism ----------------------------------------------------------------------------------
@@ -336,6 +364,17 @@ def test_arms_that_stand_too_close_find_home(model):
 def test_no_way_ends_closer_than_the_margin(model):
     ways = finder(model)
     assert ways.find(model.home, too_close(model, ways)) is None
+
+
+def test_no_way_leads_to_a_goal_a_little_closer_than_the_margin_even_if_it_can_be_left(model):
+    """A way from there, gone backwards, would be one into it."""
+    ways, placement = finder(model), Placement(model.nominal.T_P_A)
+    swing = np.array([[0.0, bend, 0.2, 0.0, 0.6, 0.0] for bend in np.linspace(0.0, -1.2, 2000)])
+    clearance = model.geometry.clearance([[0.0, -0.75, 0.2, 0.0, 0.6, 0.0]], swing, placement)
+    close = swing[np.flatnonzero((clearance > 0.018) & (clearance < ways.margin - 1e-3))[0]]
+    goal = Posture.of([0.0, -0.75, 0.2, 0.0, 0.6, 0.0], close)
+    assert ways.find(goal, model.home) is not None
+    assert ways.find(model.home, goal) is None
 
 
 def test_an_arm_that_was_jogged_beyond_the_procedures_limits_comes_in_but_is_not_sent_there(model):

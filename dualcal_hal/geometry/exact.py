@@ -101,7 +101,11 @@ class ExactCell:
 
         A part that is wholly inside a mesh is as far from it as from its surface. Parts of one arm have their relief.
         """
-        return min((a.distance(b) + relief for a, b, relief in self._neighbours(q_a, q_p, T_P_A)), default=np.inf)
+        return float(np.min(self.clearances(q_a, q_p, T_P_A), initial=np.inf))
+
+    def clearances(self, q_a: ArrayLike, q_p: ArrayLike, T_P_A: Array) -> Array:
+        """The same of each two that are held against each other, (p,), in the same order for all postures."""
+        return np.array([a.distance(b) + relief for a, b, relief in self._neighbours(q_a, q_p, T_P_A)])
 
     def _neighbours(self, q_a: ArrayLike, q_p: ArrayLike, T_P_A: Array) -> Iterator[tuple[_Placed, _Placed, float]]:
         """All that must not come close to each other, and the relief."""

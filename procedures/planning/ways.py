@@ -17,6 +17,9 @@ from procedures.planning.model import CellModel, Posture
 from procedures.planning.moves import Mover
 from procedures.planning.search import Search
 
+_TRUE_ROUNDING = 1e-5
+"""m by which distances of true shapes may differ that are the same."""
+
 
 @dataclass(frozen=True)
 class Leg:
@@ -94,20 +97,22 @@ class WayFinder:
         paths = list(self._together.direct(here, there))
         obstructed = list(filter(None, map(self._obstruction, paths)))
         if not obstructed and not any(self._is_truly_clear(start, self._legs(path)) for path in paths):
-            return "in their true shapes the arms come too close to each other or to what stands about them"
+            return (
+                "in their true shapes the arms come too close to each other, to themselves or to what stands about them"
+            )
         return "; ".join(obstructed)
 
     def is_clear_in_true_shapes(self, posture: Posture) -> bool:
         """Whether a posture keeps the procedure's clearance in the true shapes, the bases standing as believed."""
-        return self._true_clearance(_point(posture)) >= self._model.margin
+        return bool(np.all(self._true_clearances(_point(posture)) >= self._model.margin))
 
     def _is_truly_clear(self, start: Posture, way: Sequence[Leg]) -> bool:
         """Whether each leg's posture of least clearance, and where it ends, keep clear in the true shapes.
 
-        Who stands closer than told at first may leave.
+        What is closer than told at first may be left: each two parts come no closer than they were.
         """
-        least = min((self._true_clearance(point) for point in self._closest(start, way)), default=np.inf)
-        return least >= self._model.margin or least >= self._true_clearance(_point(start))
+        allowed = np.minimum(self._model.margin, self._true_clearances(_point(start))) - _TRUE_ROUNDING
+        return all(np.all(self._true_clearances(point) >= allowed) for point in self._closest(start, way))
 
     def _closest(self, start: Posture, way: Sequence[Leg]) -> Iterator[Array]:
         """Of each leg the checked point with the least clearance, and its end."""
@@ -118,9 +123,9 @@ class WayFinder:
                 passed[mover.axes] = q
                 yield passed
 
-    def _true_clearance(self, point: Array) -> float:
+    def _true_clearances(self, point: Array) -> Array:
         joints = self._model.active.chain.joints
-        return self._model.exact.clearance(point[:joints], point[joints:], self._T_P_A)
+        return self._model.exact.clearances(point[:joints], point[joints:], self._T_P_A)
 
     def _can_alone(self, here: Array, there: Array) -> bool:
         """Whether each arm could go there if the other were not: most goals without a way fail here, and sooner."""

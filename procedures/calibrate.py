@@ -31,18 +31,20 @@ from procedures.events import (
     PlanReady,
     PointDone,
 )
+from procedures.planning.advice import counted
 from procedures.planning.belief import Belief
 from procedures.planning.candidates import ROOM
 from procedures.planning.first_look import find_stand_off, look_postures
 from procedures.planning.model import CellModel, Posture
 from procedures.planning.plan import Plan, PlannedConstraint
-from procedures.planning.poses import PosePlanner, Request
+from procedures.planning.poses import PosePlanner, Request, judged_anew
 from procedures.planning.refine import LEAST_VIEWS, WORST_FIT, View, arrival_scatter, refine
 from procedures.planning.ways import WayFinder
 from procedures.seeing import see
 from procedures.steps import Believe, KeepDocument, KeepImage, Procedure, move, read, task, tell
 
 _TRIES_A_LOOK = 20
+NO_WAY_TO_LOOK = "no clear way leads there"
 _WHAT_TO_CHECK = (
     "check square_mm, target_mount, the camera's matrix, the nominal transforms, and order, sign and zero of the joints"
 )
@@ -183,9 +185,11 @@ class Calibration:
 
     def _look(self, stand_off: Posture, number: int) -> Procedure[LookRecord]:
         reason, taken = "no posture for it keeps clear and shows the target", 0
-        postures = look_postures(self._model, self._belief, self._ways, stand_off, number)
+        refused: Counter[str] = Counter()
+        postures = look_postures(self._model, self._belief, self._ways, stand_off, number, refused)
         for posture in itertools.islice(postures, _TRIES_A_LOOK):
             if not (yield from self._go(posture)):
+                refused[NO_WAY_TO_LOOK] += 1
                 continue
             picture = yield from see(self._model, self._detector, self._belief)
             if picture.sighting is not None and picture.detection is not None and not picture.reason:
@@ -196,7 +200,8 @@ class Calibration:
             if picture.sighting is not None:
                 # What the camera saw instead of the target tells what is wrong.
                 yield KeepImage(f"looks/{number}-{taken}", picture.sighting.frame.image)
-        return LookRecord(None, f"{reason} ({taken} pictures)" if taken > 1 else reason)
+        reason = f"{reason} ({taken} pictures)" if taken > 1 else reason
+        return LookRecord(None, f"{reason}. {counted(refused)}" if refused.total() else reason)
 
     # -- constraints --------------------------------------------------------------------------------------------
 
@@ -208,21 +213,30 @@ class Calibration:
 
     def _adopt_plan(self, plan: Plan) -> Procedure[None]:
         self._plan = plan
-        believed = {T_P_A_NAME: self._belief.T_P_A.tolist(), T_H_E_NAME: self._belief.T_H_E.tolist()}
-        yield KeepDocument("plan.json", {**plan.to_record(), "transforms": believed})
+        belief, placement = self._belief, self._belief.placement
+        believed = {
+            "transforms": {T_P_A_NAME: belief.T_P_A.tolist(), T_H_E_NAME: belief.T_H_E.tolist()},
+            "allowed_base_error": {
+                "translation_mm": placement.translation * 1e3,
+                "rotation_deg": float(np.rad2deg(placement.rotation)),
+            },
+        }
+        yield KeepDocument("plan.json", {**plan.to_record(), **believed})
         yield from tell(PlanReady(plan))
 
     def _constraints(self, request: Request, queue: list[PlannedConstraint]) -> Procedure[None]:
         """Capture as many constraints as requested; one that fails is replaced by another."""
         captured: tuple[PlannedConstraint, ...] = ()
-        given_up, next_number = 0, len(queue)
+        given_up: list[PlannedConstraint] = []
+        next_number = len(queue)
         while len(captured) < request.constraints:
             if not queue or self._is_outdated(queue[0]):
                 count = request.constraints - len(captured)
                 missing = Request(request.use, count, request.positions, next_number, captured)
                 key = StepKey("plan", f"{request.use}/{next_number:02d}", None, "replacement")
                 again = yield from task(key, lambda r=missing, k=key: self._select([r], k.constraint), Plan)  # type: ignore[misc]
-                yield from self._adopt_plan(self._plan.replaced(queue, again))
+                plan = self._plan.replaced([*given_up, *queue], again)
+                yield from self._adopt_plan(judged_anew(plan, self._model, self._belief))
                 queue = list(again.constraints)
                 next_number += len(queue)
             constraint = queue.pop(0)
@@ -231,10 +245,12 @@ class Calibration:
                 captured = (*captured, constraint)
                 yield from tell(ConstraintDone(request.use, constraint.name, len(captured), request.constraints))
             else:
-                given_up += 1
+                given_up.append(constraint)
                 yield from tell(ConstraintGivenUp(constraint.name, failure))
-                if given_up > _REPLACEMENTS * request.constraints:
-                    raise NoPlan(f"{given_up} {request.use} constraints were given up, the last one because: {failure}")
+                if len(given_up) > _REPLACEMENTS * request.constraints:
+                    raise NoPlan(
+                        f"{len(given_up)} {request.use} constraints were given up, the last one because: {failure}"
+                    )
             if self._views:
                 yield from self._refine()
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from dualcal_hal.config import CellConfig, ProcedureConfig
 from dualcal_hal.errors import NoPlan
-from procedures.calibrate import requests_of
+from procedures.calibrate import NO_WAY_TO_LOOK, requests_of
 from procedures.planning.advice import counted
 from procedures.planning.first_look import StandOff, find_stand_off, look_postures
 from procedures.planning.model import CellModel, Posture
@@ -93,7 +93,7 @@ def _looks(
                 looks.append(RehearsedLook(way))
                 here = posture
                 break
-            refused["no clear way leads there"] += 1
+            refused[NO_WAY_TO_LOOK] += 1
         else:
             looks.append(RehearsedLook(None, f"no posture for it will do. {counted(refused)}"))
     _require_enough(looks, procedure)

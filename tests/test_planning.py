@@ -13,17 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dualcal_hal.errors import NoPlan
+from dualcal_hal.geometry import CellGeometry, Placement
 from dualcal_hal.geometry.exact import ExactCell
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import inverse, rotation_from_vector, transform
 from procedures.calibrate import requests_of
 from procedures.planning.advice import advice
-from procedures.planning.candidates import ROOM
+from procedures.planning.candidates import ROOM, CandidateSource
 from procedures.planning.choice import LEAST_SPREAD, LEAST_TURN, Knowledge, most_informative, turned_about_two_axes
 from procedures.planning.model import CellModel, Posture
 from procedures.planning.order import shortest_order
 from procedures.planning.plan import Plan
-from procedures.planning.poses import POINT_SECONDS, PosePlanner, Request
+from procedures.planning.poses import POINT_SECONDS, PosePlanner, Request, judged_anew
 from procedures.planning.ways import Leg, WayFinder
 from tests.cells import paper_cell
 from tests.walking import least_clearance, seen_from_camera, walk
@@ -164,6 +165,14 @@ def test_the_passive_arm_has_room_to_move_each_way_in_the_camera_plane(model, be
                 assert model.geometry.clearance([constraint.active], q, belief.placement)[0] > 0.02
 
 
+def test_a_candidate_is_clear_where_alignment_may_take_it_or_it_is_none(model, belief, monkeypatch):
+    """As if its positions were clear, and nothing within the room about them."""
+    monkeypatch.setattr(CellGeometry, "clearance", lambda self, q_a, q_p, placement: np.zeros(len(q_p)))
+    source = CandidateSource(model, belief, np.random.default_rng(1))
+    assert source.draw(POSITIONS, 1, 200) == []
+    assert source.refused["no room for alignment"] > 0
+
+
 def test_between_the_positions_of_a_constraint_the_passive_arm_goes_straight(model, belief, plan):
     for postures in stops(plan):
         for one, other in itertools.pairwise(postures):
@@ -250,6 +259,16 @@ def test_of_candidates_in_a_narrow_cone_and_some_outside_a_well_spread_choice_is
     assert spread.well_spread
 
 
+def test_where_flanges_turned_about_one_axis_would_tell_most_one_that_is_turned_about_another_is_taken():
+    rng = np.random.default_rng(1)
+    turns = [rotation_from_vector([0, 0, angle]) for angle in rng.uniform(-1, 1, 15)]
+    pool = [told_by(rng.standard_normal(3), rng, turn) for turn in turns]
+    pool = [replace(told, information=1e4 * told.information) for told in pool]
+    pool += [told_by(np.array([1.0, 0.1, 0.1]), rng, rotation_from_vector([1.0, 0, 0]))]
+    chosen = most_informative(pool, 6, Knowledge.together([]), well_spread=True)
+    assert Knowledge.together([pool[i] for i in chosen]).well_spread
+
+
 def test_a_choice_is_better_than_any_that_differs_in_one():
     rng = np.random.default_rng(2)
     pool = [told_by(rng.standard_normal(3), rng) for _ in range(12)]
@@ -329,12 +348,33 @@ def test_the_same_seed_gives_the_same_plan_and_another_seed_another(cell, ways, 
     assert made(cell, ways, seed=2) != plan
 
 
-def test_a_plan_in_part_replaced_is_planned_from_the_transforms_believed_then(plan):
-    gone, kept = plan.constraints[0], plan.constraints[1:]
-    later = replace(plan, constraints=(replace(gone, name="calibration/07"),), planned_from="12 views")
+@pytest.mark.parametrize("use", ["calibration", "verification"])
+@pytest.mark.parametrize("given_up", [0, -1])
+def test_what_replaces_constraints_stands_where_it_is_visited_after_those_kept_of_its_use(plan, use, given_up):
+    gone = plan.of(use)[given_up]
+    later = replace(plan, constraints=(replace(gone, name=f"{use}/07"),), planned_from="12 views")
     both = plan.replaced([gone], later)
-    assert both.constraints == (*kept, *later.constraints)
+    assert gone not in both.constraints
+    assert both.of(use) == (*(one for one in plan.of(use) if one != gone), *later.constraints)
+    assert [one.use for one in both.constraints] == [one.use for one in plan.constraints]
     assert both.planned_from == "12 views"
+
+
+def test_a_plan_that_is_judged_anew_has_the_clearances_and_the_spread_of_another_belief(model, belief, plan):
+    moved = belief.T_P_A @ transform(rotation_from_vector([0.0, 0.0, 0.02]), [0.01, 0.0, 0.005])
+    now = replace(belief, T_P_A=moved, placement=Placement(moved, 0.02, 0.01), source="12 views")
+    again = judged_anew(plan, model, now)
+    assert again.planned_from == "12 views"
+    axes = axes_of(model, now, plan.of("calibration"))
+    assert again.axis_spread == pytest.approx(np.linalg.eigvalsh(axes.T @ axes / len(axes))[0])
+    for before, after, postures in zip(plan.constraints, again.constraints, stops(plan), strict=True):
+        assert stops(again) == stops(plan)
+        assert (after.name, after.seconds) == (before.name, before.seconds)
+        for position, posture in zip(after.positions, postures, strict=True):
+            expected = model.geometry.clearance([posture.active], [posture.passive], now.placement)[0]
+            assert position.clearance == pytest.approx(expected)
+    verification = replace(plan, constraints=plan.of("verification"))
+    assert judged_anew(verification, model, now).axis_spread is None
 
 
 def test_a_plan_survives_its_file_to_the_last_bit(plan):
@@ -353,13 +393,13 @@ def test_the_simulators_truth_changes_no_plan(plan):
 
 def test_what_the_true_shapes_forbid_is_replaced_and_counted(cell, ways, plan, monkeypatch):
     """As if the shape of something were not inside its capsules, where the first constraint of the plan is."""
-    clearance = ExactCell.clearance
+    clearances = ExactCell.clearances
     forbidden = plan.constraints[0].active
 
     def narrower(self, q_a, q_p, T_P_A):
-        return 0.019 if tuple(q_a) == forbidden else clearance(self, q_a, q_p, T_P_A)
+        return np.array([0.019]) if tuple(q_a) == forbidden else clearances(self, q_a, q_p, T_P_A)
 
-    monkeypatch.setattr(ExactCell, "clearance", narrower)
+    monkeypatch.setattr(ExactCell, "clearances", narrower)
     other = made(cell, ways)
     assert forbidden not in [c.active for c in other.constraints]
     assert other.refused["too close in the true shapes"] == 1

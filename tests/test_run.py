@@ -21,7 +21,8 @@ from typer.testing import CliRunner
 
 from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import load_cell
-from dualcal_hal.errors import LinkLost, NotOpen
+from dualcal_hal.errors import LinkLost, NoPlan, NotOpen
+from dualcal_hal.geometry import CellGeometry, Placement
 from dualcal_hal.guard import CellGuard, GuardedRobot
 from dualcal_hal.session.captures import read_captures
 from dualcal_hal.session.folder import Session
@@ -185,6 +186,55 @@ def test_what_the_belief_has_outdated_is_planned_anew_and_the_plan_says_so(tmp_p
     plan = json.loads((tmp_path / "s" / "plan.json").read_text())
     captured = {capture.constraint for capture in read_captures(tmp_path / "s" / "captures.json").captures}
     assert captured <= {constraint["constraint"] for constraint in plan["constraints"]}
+
+
+def run_small(folder, *overrides):
+    """The file of the small cell, and its run's session."""
+    file = load_cell(PAPER, (*SMALL, *overrides))
+    session = Session.create(folder, file.text)
+    execute(Cell(file), Calibration(file.cell, CellModel(file.cell)), session, lambda event: None)
+    return file, session
+
+
+@pytest.mark.parametrize("fails", ["calibration/00", "calibration/02", "verification/00"])
+def test_after_a_replacement_the_plan_is_of_what_was_captured_in_its_order_and_by_its_own_transforms(
+    tmp_path, monkeypatch, fails
+):
+    attempt = Calibration._constraint
+
+    def failing(self, constraint):
+        return "as if it were" if constraint.name == fails else (yield from attempt(self, constraint))
+
+    monkeypatch.setattr(Calibration, "_constraint", failing)
+    file, session = run_small(tmp_path / "s")
+    plan = json.loads((session.folder / "plan.json").read_text())
+    captured = [capture.constraint for capture in captures_of(session.journal, "", None).captures]
+    assert [constraint["constraint"] for constraint in plan["constraints"]] == list(dict.fromkeys(captured))
+    assert fails not in captured
+    T_P_A, T_H_E = (np.array(T) for T in plan["transforms"].values())
+    axes = [
+        (T_P_A @ file.cell.active.chain.forward(constraint["active_joints_rad"]) @ T_H_E)[:3, 2]
+        for constraint in plan["constraints"]
+        if constraint["use"] == "calibration"
+    ]
+    assert plan["axis_spread"] == pytest.approx(np.linalg.eigvalsh(np.transpose(axes) @ axes)[0] / 3)
+    error = plan["allowed_base_error"]
+    placement = Placement(T_P_A, error["translation_mm"] / 1e3, np.deg2rad(error["rotation_deg"]))
+    geometry = CellGeometry.of(file.cell, T_H_E)
+    for constraint in plan["constraints"]:
+        passive = [position["passive_joints_rad"] for position in constraint["positions"]]
+        told = [position["clearance_m"] for position in constraint["positions"]]
+        np.testing.assert_allclose(geometry.clearance([constraint["active_joints_rad"]], passive, placement), told)
+
+
+def test_where_no_posture_for_a_look_will_do_the_refusal_says_why(tmp_path, monkeypatch):
+    def none(model, belief, ways, at, number, refused):
+        refused["'left' does not get there"] += 8
+        return iter(())
+
+    monkeypatch.setattr("procedures.calibrate.look_postures", none)
+    with pytest.raises(NoPlan, match=r"look 1: no posture .*\. Refused: 'left' does not get there: 8\)"):
+        run_small(tmp_path / "s")
 
 
 def test_every_look_from_the_third_on_and_every_constraint_gives_other_transforms_to_plan_with(tmp_path, monkeypatch):

@@ -50,7 +50,7 @@ class Knowledge:
     @property
     def spread(self) -> float:
         """Smallest eigenvalue of the mean of z z^T over the axes."""
-        return float(np.linalg.eigvalsh(self.axes.T @ self.axes)[0] / max(len(self.axes), 1))
+        return spread_of(self.axes)
 
     @property
     def turn(self) -> float:
@@ -131,6 +131,11 @@ def _best_addition(pool: Sequence[Knowledge], chosen: Sequence[int], known: Know
     if have.turn < LEAST_TURN:  # one more never takes a turn away
         nearness += [min(1.0, Knowledge.together([have, pool[i]]).turn / LEAST_TURN) for i in left]
     return left[int(np.lexsort((worth, nearness))[-1])]
+
+
+def spread_of(axes: Array) -> float:
+    """Smallest eigenvalue of the mean of z z^T over optical axes (k, 3); zero where there are none."""
+    return float(np.linalg.eigvalsh(axes.T @ axes)[0] / max(len(axes), 1))
 
 
 def turned_about_two_axes(R: Array) -> float:

@@ -111,15 +111,20 @@ class Plan:
         return tuple(constraint for constraint in self.constraints if constraint.use == use)
 
     def replaced(self, dropped: Sequence[PlannedConstraint], by: Plan) -> Plan:
-        """This plan with constraints that will not be visited dropped, and those of another plan in their place.
+        """This plan with those of another in place of constraints that were given up or will not be visited.
 
-        It is then planned from what the other one was, the transforms that are believed now.
+        What is kept of the same use has been visited by then, so the new ones are the last of it. The plan is then
+        planned from what the other one was, the transforms that are believed now.
         """
-        names = {constraint.name for constraint in dropped}
-        kept = tuple(constraint for constraint in self.constraints if constraint.name not in names)
+        names, uses = {constraint.name for constraint in dropped}, {constraint.use for constraint in by.constraints}
+        end = 1 + max((i for i, constraint in enumerate(self.constraints) if constraint.use in uses), default=-1)
+        before, after = (
+            [constraint for constraint in part if constraint.name not in names]
+            for part in (self.constraints[:end], self.constraints[end:])
+        )
         refused = {what: self.refused.get(what, 0) + by.refused.get(what, 0) for what in {**self.refused, **by.refused}}
         spread = self.axis_spread if by.axis_spread is None else by.axis_spread
-        return Plan((*kept, *by.constraints), spread, refused, self.provisional, by.planned_from)
+        return Plan((*before, *by.constraints, *after), spread, refused, self.provisional, by.planned_from)
 
     def to_record(self) -> dict[str, Any]:
         """The content of ``plan.json``, from which :meth:`from_record` makes the same plan to the last bit."""

@@ -13,7 +13,7 @@ from dualcal_hal.transforms import Array
 from procedures.planning.advice import advice, counted
 from procedures.planning.belief import Belief
 from procedures.planning.candidates import Candidate, CandidateSource
-from procedures.planning.choice import LEAST_SPREAD, LEAST_TURN, Knowledge, most_informative
+from procedures.planning.choice import LEAST_SPREAD, LEAST_TURN, Knowledge, most_informative, spread_of
 from procedures.planning.model import ArmModel, CellModel, Posture
 from procedures.planning.order import shortest_order
 from procedures.planning.plan import Plan, PlannedConstraint, PlannedPosition
@@ -279,6 +279,24 @@ class PosePlanner:
             f"{self._ways.blocked_by(here, _begin(self._turned(last, here)))}. {counted(self.refused)}. "
             f"{advice(self._model, self._belief, success)}"
         )
+
+
+def judged_anew(plan: Plan, model: CellModel, belief: Belief) -> Plan:
+    """The same poses with the clearances and the spread of the axes that they have by another belief."""
+    constraints = tuple(_cleared_anew(constraint, model, belief) for constraint in plan.constraints)
+    active = [constraint.active for constraint in plan.of("calibration")]
+    spread = spread_of(model.camera_in_passive(active, belief)[:, :3, 2]) if active else None
+    return replace(plan, constraints=constraints, axis_spread=spread, planned_from=belief.source)
+
+
+def _cleared_anew(constraint: PlannedConstraint, model: CellModel, belief: Belief) -> PlannedConstraint:
+    passive = [position.passive for position in constraint.positions]
+    clearance = model.geometry.clearance([constraint.active], passive, belief.placement)
+    positions = (
+        replace(position, clearance=float(least))
+        for position, least in zip(constraint.positions, clearance, strict=True)
+    )
+    return replace(constraint, positions=tuple(positions))
 
 
 def _drawn_for_advice(model: CellModel, belief: Belief, request: Request) -> list[Candidate]:

@@ -1,4 +1,4 @@
-"""Tables for the command line: rich renderables, nothing is printed here. They fit into 80 columns and are ASCII."""
+"""Tables for the command line: rich renderables, nothing is printed here. They fit into 80 columns."""
 
 from __future__ import annotations
 

@@ -92,7 +92,8 @@ def test_what_is_farther_than_enough_may_be_said_to_be_nearer_but_not_than_that(
     pair = pair + np.array([[0.0], [0.4], [0.8]])[..., None, None]
     told = fixture.separation_from_afar(np.eye(4), pair, error, error)
     quick = fixture.separation_from_afar(np.eye(4), pair, error, error, [enough, enough + 0.1])
-    assert np.all((quick == told) | ((quick >= [enough, enough + 0.1]) & (told >= [enough, enough + 0.1])))
+    far = (quick >= [enough, enough + 0.1]) & (told >= [enough, enough + 0.1])
+    assert np.all(far | (np.abs(quick - told) < 1e-3))
 
 
 def test_a_tip_of_a_mesh_does_not_slip_between_the_points_of_a_segment():

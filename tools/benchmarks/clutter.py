@@ -50,7 +50,7 @@ def _grating(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
     wave = np.max(waves, axis=0)
     if rng.random() < 0.5:
         wave = np.clip(3 * wave, -1, 1)
-    return np.rint(128 + rng.uniform(20, 120) * wave).astype(np.uint8)
+    return np.asarray(np.rint(128 + rng.uniform(20, 120) * wave), dtype=np.uint8)
 
 
 def _draw_other_checkerboard(rng: np.random.Generator, image: Image) -> None:
@@ -67,7 +67,7 @@ def _draw_other_checkerboard(rng: np.random.Generator, image: Image) -> None:
     turn = cv2.getRotationMatrix2D((large.shape[1] / 2, large.shape[0] / 2), rng.uniform(0, 360), side / cell)
     half = 0.5 * side * np.hypot(*board.shape)
     middle = [rng.uniform(min(half, n / 2), max(n - half, n / 2)) for n in image.shape[::-1]]
-    turn[:, 2] += np.array(middle) - np.array(large.shape[::-1]) / 2
+    turn[:, 2] = turn[:, 2] + np.array(middle) - np.array(large.shape[::-1]) / 2
     size = image.shape[::-1]
     covered = cv2.warpAffine(np.full_like(large, 255), turn, size) > 127
     image[covered] = cv2.warpAffine(large, turn, size, flags=cv2.INTER_LINEAR)[covered]

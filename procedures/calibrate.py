@@ -27,6 +27,7 @@ from procedures.events import (
     ConstraintDone,
     ConstraintGivenUp,
     LookTaken,
+    NominalContradicted,
     NotHome,
     PlanReady,
     PointDone,
@@ -38,7 +39,7 @@ from procedures.planning.first_look import find_stand_off, look_postures
 from procedures.planning.model import CellModel, Posture
 from procedures.planning.plan import Plan, PlannedConstraint
 from procedures.planning.poses import PosePlanner, Request, judged_anew
-from procedures.planning.refine import LEAST_VIEWS, WORST_FIT, View, arrival_scatter, refine
+from procedures.planning.refine import LEAST_VIEWS, WORST_FIT, View, arrival_scatter, nominal_excess, refine
 from procedures.planning.ways import WayFinder
 from procedures.seeing import see
 from procedures.steps import Believe, KeepDocument, KeepImage, Procedure, move, read, task, tell
@@ -174,9 +175,11 @@ class Calibration:
         if len(self._views) < LEAST_VIEWS:
             raise NoPlan(
                 f"first look: {len(self._views)} looks found the target, {LEAST_VIEWS} are needed "
-                f"({'; '.join(reasons)}); see the pictures under images/looks; "
+                f"({'; '.join(reasons)}); see the pictures images/looks-*.png; "
                 "check the nominal transforms, the lighting and that nothing hides the target"
             )
+        if (excess := nominal_excess(self._model, self._belief)) is not None:
+            yield from tell(NominalContradicted(*excess))
 
     def _stand_off(self) -> Procedure[StandOffRecord]:
         here = yield from self._here()

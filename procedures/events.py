@@ -100,6 +100,22 @@ class BeliefRefined:
 
 
 @dataclass(frozen=True)
+class NominalContradicted:
+    """The looks found the bases farther from their nominal place than ``nominal.uncertainty`` allows; m and rad."""
+
+    translation: float
+    rotation: float
+
+    def __str__(self) -> str:
+        off = f"{self.translation * 1e3:.0f} mm and {np.rad2deg(self.rotation):.1f} deg"
+        return (
+            f"warning: the looks found the bases {off} from where the cell file has them, farther than "
+            "nominal.uncertainty allows: the way so far was not sure to be clear. The run goes on by what was found; "
+            "correct the nominal transforms or raise the uncertainty"
+        )
+
+
+@dataclass(frozen=True)
 class NotHome:
     """All is captured, but no clear way home was found."""
 

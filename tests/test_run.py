@@ -314,6 +314,24 @@ def test_a_run_without_verification_is_unverified_and_not_a_success(tmp_path):
     assert (result.exit_code, document["verdict"], document["mismatch_mm"]) == (1, "unverified", None)
 
 
+def test_bases_farther_off_than_the_cell_file_allows_are_told_and_gone_by_as_they_were_found(tmp_path):
+    result = dualcal(
+        "run",
+        PAPER,
+        "--out",
+        tmp_path / "s",
+        *sets(
+            *SMALL,
+            "nominal.uncertainty={translation_mm: 10, rotation_deg: 0.5}",
+            "simulation.truth.active_base_in_passive_base.translation_mm=[1120, 0, 0]",
+        ),
+    )
+    assert result.exit_code == 0
+    assert re.search(r"warning: the looks found the bases \d+ mm and \d", " ".join(result.stdout.split()))
+    plan = json.loads((tmp_path / "s" / "plan.json").read_text())
+    assert plan["allowed_base_error"] == {"translation_mm": pytest.approx(15), "rotation_deg": pytest.approx(0.6)}
+
+
 def test_a_mismatch_above_the_limit_fails(tmp_path):
     result = dualcal(
         "run", PAPER, "--json", "--out", tmp_path / "s", *sets(*SMALL, "procedure.verification.limit_mm=0.0001")

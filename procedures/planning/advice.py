@@ -91,7 +91,8 @@ def _changes(model: CellModel, belief: Belief) -> Iterator[_Change]:
         belief,
     )
     # The placement is as wrong as before but not the nominal's own: so the housing stands where the lens is then.
-    turned = replace(belief, T_H_E=_along_flange(belief.T_H_E), placement=replace(belief.placement))
+    placement = replace(belief.placement, T_P_A=belief.placement.T_P_A.copy())
+    turned = replace(belief, T_H_E=_along_flange(belief.T_H_E), placement=placement)
     yield _Change(
         f"mount the camera on '{model.active.name}' so that it looks away from the flange",
         model.believing(turned),

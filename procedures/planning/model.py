@@ -140,7 +140,7 @@ class CellModel:
 
     def believing(self, belief: Belief) -> Self:
         """The same cell with the camera's housing where a belief from enough looks says."""
-        if belief.placement is self.nominal.placement:
+        if belief.placement.T_P_A is self.nominal.placement.T_P_A:
             return self
         other = self.but(geometry=CellGeometry.of(self._cell, belief.T_H_E), _T_H_E=belief.T_H_E)
         vars(other).pop("exact", None)

@@ -9,10 +9,10 @@ import numpy as np
 
 from dualcal_hal.geometry import Placement
 from dualcal_hal.robot import Joints
-from dualcal_hal.transforms import Array
+from dualcal_hal.transforms import Array, rotation_angle
 from procedures.detection import board_poses
 from procedures.estimation.corner_fit import Prior, fit_corners
-from procedures.planning.belief import Belief
+from procedures.planning.belief import LEAST_ERROR, Belief
 from procedures.planning.model import CellModel
 
 WORST_FIT = 3.0
@@ -36,8 +36,9 @@ class View:
 def refine(model: CellModel, views: Sequence[View]) -> tuple[Belief, float]:
     """The belief that explains the views, and its rms in px per axis.
 
-    The error that it keeps clear of is the fit's, or the nominal placement's while that says more. ValueError if
-    nothing near the nominal explains them.
+    Clear is kept of the fitted placement by the fit's error. Of the nominal one by its own instead while there are too
+    few views, and while the fit says less than the nominal does and nothing against it. ValueError if nothing near the
+    nominal explains the views.
     """
     corners = np.stack([view.corners for view in views])
     # Only few views need starts of their own; with many the nominal has been left behind long ago.
@@ -55,9 +56,29 @@ def refine(model: CellModel, views: Sequence[View]) -> tuple[Belief, float]:
     )
     belief = Belief.fitted(fit.T_P_A, fit.T_H_E, fit.covariance, f"{len(views)} views")
     nominal = model.nominal.placement
-    if len(views) < LEAST_VIEWS or _error_at_a_metre(belief.placement) > _error_at_a_metre(nominal):
+    if len(views) < LEAST_VIEWS:
+        return replace(belief, placement=nominal), fit.rms
+    if nominal.translation < LEAST_ERROR[0] or nominal.rotation < LEAST_ERROR[1]:
+        # Not even a tape measure is trusted further than a fit.
+        errors = max(nominal.translation, LEAST_ERROR[0]), max(nominal.rotation, LEAST_ERROR[1])
+        nominal = Placement(nominal.T_P_A, *errors)
+    says_less = _error_at_a_metre(belief.placement) > _error_at_a_metre(nominal)
+    if says_less and nominal_excess(model, belief) is None:
         belief = replace(belief, placement=nominal)
     return belief, fit.rms
+
+
+def nominal_excess(model: CellModel, belief: Belief) -> tuple[float, float] | None:
+    """How far (m, rad) a fitted belief has the active base from its nominal place, if that is more than the cell file
+    allows and the fit may be wrong by; None if it is not."""
+    nominal, fitted = (
+        model.nominal.placement,
+        Belief.fitted(belief.T_P_A, belief.T_H_E, belief.covariance, "").placement,
+    )
+    translation = float(np.linalg.norm(belief.T_P_A[:3, 3] - nominal.T_P_A[:3, 3]))
+    rotation = float(rotation_angle(belief.T_P_A[:3, :3], nominal.T_P_A[:3, :3]))
+    allowed = nominal.translation + fitted.translation, nominal.rotation + fitted.rotation
+    return (translation, rotation) if translation > allowed[0] or rotation > allowed[1] else None
 
 
 def _error_at_a_metre(placement: Placement) -> float:

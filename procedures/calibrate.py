@@ -40,6 +40,7 @@ from procedures.planning.model import CellModel, Posture
 from procedures.planning.plan import Plan, PlannedConstraint
 from procedures.planning.poses import PosePlanner, Request, judged_anew
 from procedures.planning.refine import LEAST_VIEWS, WORST_FIT, View, arrival_scatter, nominal_excess, refine
+from procedures.planning.sight import require_visible
 from procedures.planning.ways import WayFinder
 from procedures.seeing import see
 from procedures.steps import Believe, KeepDocument, KeepImage, Procedure, move, read, task, tell
@@ -134,6 +135,7 @@ class Calibration:
         self._model = model
         self._detector = Detector(model.board, model.intrinsics.size)
         self._arrivals_px: list[Array] = []
+        require_visible(model)
         tolerance_px(model, cell.procedure.tolerance_px)
         self._belief = model.nominal
         self._views: list[View] = []

@@ -332,6 +332,19 @@ def test_bases_farther_off_than_the_cell_file_allows_are_told_and_gone_by_as_the
     assert plan["allowed_base_error"] == {"translation_mm": pytest.approx(15), "rotation_deg": pytest.approx(0.6)}
 
 
+@pytest.mark.parametrize(
+    ("override", "what"),
+    [
+        ("target.square_mm=0.025", "target.square_mm: a square of 0.025 mm is 0.041 px wide at the largest distance"),
+        ("procedure.distance_mm=[0.3, 0.5]", "procedure.distance_mm: at 0.3 mm the target is"),
+    ],
+)
+def test_a_length_in_metres_where_millimetres_are_meant_is_asked_about(override, what):
+    result = dualcal("run", PAPER, "--dry-run", "--set", override)
+    assert result.exit_code == 2
+    assert what in result.stderr
+
+
 def test_a_mismatch_above_the_limit_fails(tmp_path):
     result = dualcal(
         "run", PAPER, "--json", "--out", tmp_path / "s", *sets(*SMALL, "procedure.verification.limit_mm=0.0001")

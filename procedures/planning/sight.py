@@ -5,16 +5,41 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dualcal_hal.errors import UsageError
 from dualcal_hal.geometry import ArmBody, segment_distance
 from dualcal_hal.transforms import Array, Mask, apply, inverse
 from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel
+
+LEAST_SQUARE_PX = 3.0
+"""Width of a square in the image below which no corner can be told from noise."""
 
 SIGHT_MARGIN = 0.010
 """m that lines of sight keep from what could hide the target."""
 
 ROUND_END = 2.0
 """Link radii along a line of sight by which the links that carry the target may stand before it."""
+
+
+def require_visible(model: CellModel) -> None:
+    """UsageError where no pose can show the target: squares of next to no pixels, or a pattern larger than the image.
+
+    Most often a length is in another unit than its key says.
+    """
+    focal = float(np.sqrt(np.linalg.det(model.intrinsics.matrix[:2, :2])))
+    near, far = model.distance
+    square = model.board.square
+    if focal * square / far < LEAST_SQUARE_PX:
+        raise UsageError(
+            f"target.square_mm: a square of {square * 1e3:g} mm is {focal * square / far:.2g} px wide at the largest "
+            f"distance, {far * 1e3:g} mm, of {LEAST_SQUARE_PX:g} px at the least; are both in mm?"
+        )
+    smaller = focal * float(np.min(np.ptp(model.board.outline[:, :2], axis=0))) / near
+    if smaller > max(model.intrinsics.size):
+        raise UsageError(
+            f"procedure.distance_mm: at {near * 1e3:g} mm the target is {smaller:.0f} px wide, wider than the image; "
+            "is the distance in mm, and target.square_mm?"
+        )
 
 
 def in_sight(model: CellModel, q_a: ArrayLike, q_p: ArrayLike, belief: Belief) -> Mask:

@@ -202,5 +202,6 @@ def _plan_notes(plan: Plan) -> Iterator[str]:
     if plan.axis_spread is not None:
         yield f"Spread of the axes {plan.axis_spread:.3f}: least eigenvalue of mean(z z^T), at least {LEAST_SPREAD:g}."
     error = "whatever the bases' error is after the looks" if plan.provisional else "whatever the bases' error"
-    yield f"clear: {error}; manip.: sqrt(det J J^T); to limit:"
-    yield "of the joint nearest to the limits a procedure keeps. Each is the least of both arms."
+    yield f"clear: {error}. manip.: sqrt(det J J^T)."
+    yield "to limit: of the joint nearest to the limits a procedure keeps."
+    yield "Each is the least of both arms."

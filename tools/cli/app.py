@@ -62,7 +62,7 @@ def estimate(
 ) -> None:
     """Estimate and verify from captures, without any device.
 
-    Exit code 0 once a result is written, 2 for a call, cell file or captures that cannot be used.
+    Exit code 0 once there is a result, 2 for a call, cell file or captures that cannot be used.
     """
     with ended_in_order():
         from tools.cli.estimate import EstimateOptions, estimate_captures

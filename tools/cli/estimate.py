@@ -63,6 +63,8 @@ def estimate_captures(options: EstimateOptions) -> None:
         except OSError as error:
             raise UsageError(f"{options.out}: cannot be written: {error.strerror}") from error
     show_result(console, file.cell, result, truth, as_json=options.json)
+    if options.out is None:
+        console.print("Not written to a file; --out FILE does that.")
 
 
 def _cell_path(options: EstimateOptions) -> Path:

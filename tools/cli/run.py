@@ -136,7 +136,9 @@ def execute(
             with _documents_kept(opened, session):
                 engine.run(calibration.steps())
     except Exception as error:
-        error.add_note(f"the session is kept in {session.folder}")
+        error.add_note(
+            f"the session is kept in {session.folder}; what it has so far: dualcal estimate {session.folder}"
+        )
         raise
 
 

@@ -13,7 +13,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dualcal_hal.camera import Image
@@ -49,14 +48,14 @@ def reach(half: int) -> int:
 
 def fit_saddles(image: Image, start: Array, half: int) -> Saddles:
     """Saddle points near ``start`` (n, 2) px, each at least ``reach(half)`` px inside the image."""
-    taps = np.arange(-reach(half), reach(half) + 1)
+    beyond = reach(half)
     base = np.rint(start).astype(int)
-    rows, columns = base[:, 1, None, None] + taps[:, None], base[:, 0, None, None] + taps
-    patches = image[rows, columns].astype(float)
-    quadratic = _quadratic_fit(half)
+    corners = (base - beyond).tolist()
+    patches = np.array([image[y : y + 2 * beyond + 1, x : x + 2 * beyond + 1] for x, y in corners], dtype=float)
+    fit = _QuadraticFit(half)
     points, found = start.copy(), np.ones(len(start), dtype=bool)
     for _ in range(_MAX_ITERATIONS):
-        step, is_saddle = _newton_step(patches, points - base, half, quadratic)
+        step, is_saddle = fit.newton_step(patches, points - base)
         points[found] += step[found]
         found &= is_saddle & (np.abs(points - start).max(axis=1) <= MAX_MOVE)
         settled = np.abs(step).max(axis=1) < _SETTLED
@@ -65,25 +64,39 @@ def fit_saddles(image: Image, start: Array, half: int) -> Saddles:
     return Saddles(points, found & settled)
 
 
-def _quadratic_fit(half: int) -> Array:
-    """(6, (2 half + 1)^2): a window's values to the coefficients of 1, x, y, x^2, xy, y^2."""
-    y, x = (part.ravel() for part in np.mgrid[-half : half + 1, -half : half + 1].astype(float))
-    return np.linalg.pinv(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1))
+class _QuadraticFit:
+    """The least-squares quadratic to the blurred values on a window of ``half`` px about a point of a patch.
 
+    On a symmetric window 1, x, y, xy and what x^2 and y^2 are beyond their mean are orthogonal, so that each
+    coefficient is a sum over columns of a sum over rows; so is the blur, and both are summed at once.
+    """
 
-def _newton_step(patches: Array, centres: Array, half: int, quadratic: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Steps (n, 2) from the windows' centres (n, 2) to the fitted quadratics' stationary points, and whether
-    these are saddles (n,)."""
-    taps = patches.shape[-1]
-    offsets = np.arange(taps + 2 * half) - (taps // 2 + half)
-    gaussian = np.exp(-0.5 * ((offsets - centres[:, :, None]) / (BLUR_PER_WINDOW * half)) ** 2)
-    gaussian /= gaussian.sum(axis=-1, keepdims=True)
-    # Contiguous, for the products below take twice as long on views.
-    kernels = np.ascontiguousarray(sliding_window_view(gaussian, taps, axis=-1)[:, :, ::-1])
-    windows = kernels[:, 1] @ patches @ np.swapaxes(kernels[:, 0], 1, 2)
-    _, gx, gy, xx, xy, yy = quadratic @ windows.reshape(len(centres), -1).T
-    determinant = 4.0 * xx * yy - xy * xy
-    is_saddle = determinant < 0
-    divisor = np.where(is_saddle, determinant, -np.inf)
-    step = np.stack([(xy * gy - 2.0 * yy * gx) / divisor, (xy * gx - 2.0 * xx * gy) / divisor], axis=1)
-    return np.clip(step, -1.0, 1.0), is_saddle
+    def __init__(self, half: int) -> None:
+        window, taps = np.arange(-half, half + 1), np.arange(-reach(half), reach(half) + 1)
+        x = window.astype(float)
+        powers = np.stack([np.ones_like(x), x, x * x - np.mean(x * x)], axis=1)
+        norms = np.sum(powers**2, axis=0)
+        self._norms = norms[:, None] * norms
+        self._sigma = BLUR_PER_WINDOW * half
+        # The blur's kernel depends on how far a pixel of the patch is from the place in the window. A matrix makes of
+        # the kernel (so many distances) what each power takes from each pixel (3 times the patch's side).
+        apart = taps[:, None] - window
+        self._apart = np.arange(apart.min(), apart.max() + 1)
+        shares = np.zeros((len(self._apart), 3, len(taps)))
+        shares[apart - self._apart[0], :, np.arange(len(taps))[:, None]] = powers
+        self._shares = shares.reshape(len(self._apart), -1)
+
+    def newton_step(self, patches: Array, centres: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Steps (n, 2) from the windows' centres (n, 2), px from the patches' (n, k, k), to the quadratics'
+        stationary points, and whether these are saddles (n,)."""
+        gaussian = np.exp(-0.5 * ((self._apart - centres[:, :, None]) / self._sigma) ** 2)
+        gaussian /= gaussian.sum(axis=-1, keepdims=True)
+        kernels = (gaussian.reshape(-1, len(self._apart)) @ self._shares).reshape(len(centres), 2, 3, -1)
+        coefficients = np.einsum("nip,njp->nij", kernels[:, 1] @ patches, kernels[:, 0]) / self._norms
+        gx, gy, xy = coefficients[:, 0, 1], coefficients[:, 1, 0], coefficients[:, 1, 1]
+        xx, yy = coefficients[:, 0, 2], coefficients[:, 2, 0]
+        determinant = 4.0 * xx * yy - xy * xy
+        is_saddle = determinant < 0
+        divisor = np.where(is_saddle, determinant, -np.inf)
+        step = np.stack([(xy * gy - 2.0 * yy * gx) / divisor, (xy * gx - 2.0 * xx * gy) / divisor], axis=1)
+        return np.clip(step, -1.0, 1.0), is_saddle

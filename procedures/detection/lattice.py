@@ -15,8 +15,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from dualcal_hal.camera import Image
@@ -31,6 +29,7 @@ LEAST_STEP = 6.0
 """px between neighbouring corners, below which they merge."""
 _DERIVATIVES = (((2, 0), 1 / 4), ((0, 2), 1 / 4), ((1, 1), 1 / 4))  # xx, yy, xy: orders, Sobel's scale
 _RING = 4.0  # px, radius on which a saddle's surroundings are compared with their mirror image
+_RING_X, _RING_Y = (np.rint(_RING * part(np.arange(16) * np.pi / 8)).astype(int) for part in (np.cos, np.sin))
 _LEAST_CURVATURE = 0.7  # grey levels per px^2: a contrast of 5 in a sharp image, of 20 in one that is barely usable
 _MOST_SADDLES = 600
 _BAND = 192  # rows that are worked on together: they stay in the processor's cache, a whole image does not
@@ -174,9 +173,7 @@ def find_lattices(saddles: SaddlePoints, least: int, narrowest: float = math.inf
 
 def _symmetry(image: NDArray[np.float32], u: NDArray[np.intp], v: NDArray[np.intp]) -> Array:
     """(n,): the correlation of each ring about (u, v) with itself after half a turn."""
-    angles = np.arange(16) * np.pi / 8
-    x, y = (np.rint(_RING * part(angles)).astype(int) for part in (np.cos, np.sin))
-    ring = image[v[:, None] + y, u[:, None] + x].astype(float)
+    ring = image[v[:, None] + _RING_Y, u[:, None] + _RING_X].astype(float)
     ring = ring - ring.mean(axis=1, keepdims=True)
     power = np.maximum(np.sum(ring**2, axis=1), 1e-6)
     return np.asarray(2 * np.sum(ring[:, :8] * ring[:, 8:], axis=1) / power)
@@ -203,13 +200,23 @@ def _cells(saddles: SaddlePoints, least: int, narrowest: float) -> tuple[NDArray
     spans = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > _LEAST_SINE * shorter * longer
     found = np.flatnonzero(closes & spans)
     # Most squares in clutter stand alone: only what hangs together in sufficient number is worth growing.
-    corners = np.concatenate([first[found], second[found], fourth[found]])
-    together = coo_array((np.ones(len(corners)), (np.tile(seed[found], 3), corners)), shape=(len(points), len(points)))
-    group = connected_components(together, directed=False)[1]
+    group = _groups(np.stack([part[found] for part in (seed, first, second, fourth)], axis=1), len(points))
     found = found[np.bincount(group)[group[seed[found]]] >= least]
     found = found[shorter[found] < narrowest]
     found = found[np.argsort(longer[found], kind="stable")]
     return seed[found], np.stack([a[found], b[found]], axis=1)
+
+
+def _groups(squares: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """(count,): for each corner the least that hangs together with it by ``squares`` (m, 4) that share corners."""
+    group = np.arange(count)
+    while True:
+        least = group.copy()
+        np.minimum.at(least, squares, group[squares].min(axis=1, keepdims=True))
+        least = least[least]  # what is least for one's least is so for oneself: few rounds, however long the chain
+        if np.array_equal(least, group):
+            return group
+        group = least
 
 
 def _as_array(saddles: SaddlePoints, at: dict[Place, int]) -> Array:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import statistics
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dualcal_hal.camera import Image
@@ -62,7 +64,7 @@ class CheckerboardFinder:
                 lattice_points((-1, board.columns), range(board.rows)),
             ]
         )
-        self._ring = ring
+        self._with_ring = np.concatenate([self._lattice, ring])
         self._ring_squares = (ring[:, None] + quadrants()).reshape(-1, 2)
         column, row = np.clip(ring.astype(int), 0, (board.columns - 1, board.rows - 1)).T
         self._beside_ring = row * board.columns + column
@@ -124,17 +126,20 @@ class CheckerboardFinder:
 
     def _weakest_contrast(self, image: Image, grid: Array, plane: Array) -> float:
         """The contrast of the weakest corner, if black and white alternate over the pattern and no further."""
-        contrasts = contrast(image, plane, self._lattice)
-        weakest = float((contrasts * np.sign(np.median(contrasts))).min())
+        with_ring = contrast(image, plane, self._with_ring)
+        contrasts, beside = with_ring[: len(self._lattice)], with_ring[len(self._lattice) :]
+        weakest = float((contrasts * np.sign(statistics.median(contrasts.tolist()))).min())
         raise_if_faint(weakest)
         if gap(image, grid) > GAP_LIMIT:
             raise Refused(Miss.NOT_FOUND, "the candidate's dark and bright parts do not meet like squares")
-        if self._goes_on_outside(image, plane, contrasts):
+        if self._goes_on_outside(image, plane, beside / contrasts[self._beside_ring]):
             raise Refused(Miss.NOT_FOUND, _NO_RIM)
         return weakest
 
-    def _goes_on_outside(self, image: Image, plane: Array, contrasts: Array) -> bool:
-        """Whether the pattern goes on beyond the corners, whose ``contrasts`` (n,) are signed.
+    def _goes_on_outside(self, image: Image, plane: Array, parts: Array) -> bool:
+        """Whether the pattern goes on beyond the corners.
+
+        parts: (m,) contrast of each place of the ring round them, in parts of that of the corner beside it.
 
         A part of a larger board may show little of what is beside it, the rest being hidden or outside the image. So
         one place where it goes on is enough, if there is another one that is no rim: a single one may be a shadow's
@@ -142,7 +147,7 @@ class CheckerboardFinder:
         """
         size = (image.shape[1], image.shape[0])
         in_image = inside(mapped(plane, self._ring_squares).reshape(-1, 4, 2), size, 0.0).all(axis=1)
-        parts = (contrast(image, plane, self._ring) / contrasts[self._beside_ring])[in_image]
+        parts = parts[in_image]
         goes_on, is_no_rim = parts > GOES_ON_LIMIT, np.abs(parts - 0.5) > GOES_ON_LIMIT - 0.5
         return bool(goes_on.any() and is_no_rim.sum() > 1)
 
@@ -188,46 +193,52 @@ def _near(places: Array, points: Array, within: float) -> Mask:
 def _windows(grid: Array, shape: tuple[int, int]) -> list[tuple[Array, bool]]:
     """The parts of a lattice (r, c, 2), NaN where nothing was seen, that are a whole ``shape`` (rows, columns), and
     whether the lattice ends there."""
+    rows, columns = shape
     found = []
-    for turned in (grid, np.swapaxes(grid, 0, 1))[: 1 if shape[0] == shape[1] else 2]:
-        if turned.shape[0] < shape[0] or turned.shape[1] < shape[1]:
+    for turned in (grid, np.swapaxes(grid, 0, 1))[: 1 if rows == columns else 2]:
+        if turned.shape[0] < rows or turned.shape[1] < columns:
             continue
-        there = np.pad(np.isfinite(turned[..., 0]), 1)
-        whole = sliding_window_view(there[1:-1, 1:-1], shape).all(axis=(2, 3))
-        goes_on = _goes_on(there, shape)
+        there = np.zeros((turned.shape[0] + 2, turned.shape[1] + 2), dtype=np.uint8)  # with a rim where none was seen
+        there[1:-1, 1:-1] = np.isfinite(turned[..., 0])
+        whole = _seen_in(there[1:-1, 1:-1], shape) == rows * columns
+        beside_rows, beside_columns = _seen_in(there[:, 1:-1], (1, columns)), _seen_in(there[1:-1], (rows, 1))
+        # It goes on where most of the row or column beside it was seen too.
+        on_rows, on_columns = 2 * beside_rows > columns, 2 * beside_columns > rows
+        goes_on = on_rows[: -rows - 1] | on_rows[rows + 1 :]
+        goes_on |= on_columns[:, : -columns - 1] | on_columns[:, columns + 1 :]
         for i, j in zip(*np.nonzero(whole), strict=True):
-            found.append((turned[i : i + shape[0], j : j + shape[1]], not goes_on[i, j]))
+            found.append((turned[i : i + rows, j : j + columns], not goes_on[i, j]))
     return found
 
 
-def _goes_on(there: Mask, shape: tuple[int, int]) -> Mask:
-    """Whether most of a row or column beside each window of ``shape`` was seen too.
-
-    there: (r + 2, c + 2), whether each corner of the lattice was seen, with a rim where none was.
-    """
+def _seen_in(there: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.int32]:
+    """How many corners are ``there`` (r, c), one or none each, in each window of ``shape`` (rows, columns)."""
     rows, columns = shape
-    across = sliding_window_view(there[:, 1:-1], columns, axis=1).sum(axis=2)
-    along = sliding_window_view(there[1:-1], rows, axis=0).sum(axis=2)
-    beside_rows = np.maximum(across[: -rows - 1], across[rows + 1 :])
-    beside_columns = np.maximum(along[:, : -columns - 1], along[:, columns + 1 :])
-    return np.asarray((2 * beside_rows > columns) | (2 * beside_columns > rows))
+    above = np.asarray(cv2.integral(there), dtype=np.int32)
+    return above[rows:, columns:] - above[:-rows, columns:] - above[rows:, :-columns] + above[:-rows, :-columns]
 
 
 def _orders_from_the_front(grid: Array) -> list[Array]:
     """All ways to number ``grid`` (rows, columns, 2) as a board seen from the front: two, four for a square one.
 
-    None if a square's corners do not lie round it in the same sense as those of the others.
+    From the front rows go to the right and columns down, in an image with y down. None if a square's corners do not
+    lie round it in the same sense as those of the others.
     """
-    grids = [grid, np.swapaxes(grid, 0, 1)] if grid.shape[0] == grid.shape[1] else [grid]
-    flipped = [g[::down, ::right] for g in grids for down in (1, -1) for right in (1, -1)]
-    orders = [g for g in flipped if _is_from_the_front(g)]
-    return orders if 2 * len(orders) == len(flipped) else []
-
-
-def _is_from_the_front(grid: Array) -> bool:
-    """Whether all squares keep their sense: rows to the right, columns down, in an image with y down."""
-    right, down = grid[:-1, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, :-1]
-    return bool(np.all(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0] > 0))
+    right, down = grid[:, 1:] - grid[:, :-1], grid[1:] - grid[:-1]
+    # At each square's corners, (top or bottom, left or right, ...): the sense that all squares have there, 0 for none.
+    across = np.stack([right[:-1], right[1:]])[:, None]
+    along = np.stack([down[:, :-1], down[:, 1:]])
+    turn = across[..., 0] * along[..., 1] - across[..., 1] * along[..., 0]
+    sense = np.all(turn > 0, axis=(2, 3)).astype(int) - np.all(turn < 0, axis=(2, 3))
+    grids = [(grid, sense), (np.swapaxes(grid, 0, 1), -sense.T)][: 2 if grid.shape[0] == grid.shape[1] else 1]
+    orders = [
+        turned[::down_way, ::right_way]
+        for turned, senses in grids
+        for down_way, of_row in zip((1, -1), senses, strict=True)
+        for right_way, of_corner in zip((1, -1), of_row, strict=True)
+        if down_way * right_way * of_corner > 0
+    ]
+    return orders if len(orders) == 2 * len(grids) else []
 
 
 def _choose(orders: list[Array], predicted: Array | None) -> tuple[Array, bool]:
@@ -236,12 +247,18 @@ def _choose(orders: list[Array], predicted: Array | None) -> tuple[Array, bool]:
     if predicted is None:
         return max(orders, key=lambda grid: float(np.mean(grid[:, -1, 0] - grid[:, 0, 0]))), False
     expected = _shape_of(predicted)
-    misfits = np.array([np.linalg.norm(_shape_of(grid.reshape(-1, 2)) - expected) for grid in orders])
+    shapes = _shape_of(np.stack(orders).reshape(len(orders), -1, 2))
+    misfits = _size_of(shapes - expected)
     best, second = np.argsort(misfits)[:2]
     return orders[best], bool(misfits[best] < ALIKE_LIMIT * misfits[second])
 
 
 def _shape_of(points: Array) -> Array:
-    """``points`` (n, 2) without their translation and scale."""
-    centred = points - points.mean(axis=0)
-    return np.asarray(centred / np.linalg.norm(centred))
+    """``points`` (..., n, 2) without their translation and scale."""
+    centred = points - points.mean(axis=-2, keepdims=True)
+    return np.asarray(centred / _size_of(centred)[..., None, None])
+
+
+def _size_of(points: Array) -> Array:
+    """(...): root of the sum of squares of ``points`` (..., n, 2)."""
+    return np.asarray(np.sqrt(np.sum(points * points, axis=(-2, -1))))

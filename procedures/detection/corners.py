@@ -38,7 +38,7 @@ def spacing(grid: Array) -> float:
         grid[1:, 1:] - grid[:-1, :-1],
         grid[1:, :-1] - grid[:-1, 1:],
     )
-    lengths = np.concatenate([np.linalg.norm(difference, axis=2).ravel() for difference in neighbours])
+    lengths = np.linalg.norm(np.concatenate([difference.reshape(-1, 2) for difference in neighbours]), axis=1)
     lengths = lengths[np.isfinite(lengths)]
     return float(lengths.min()) if len(lengths) else float("nan")
 

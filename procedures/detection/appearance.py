@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import statistics
+
 import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -46,18 +48,22 @@ def gap(image: Image, grid: Array) -> float:
     In parts of white minus black of the two squares beside the line: nothing where squares share an edge, a
     half where dark spots with gaps between them pass for squares.
     """
-    return max(_gap_along_rows(image, grid), _gap_along_rows(image, np.swapaxes(grid, 0, 1)))
-
-
-def _gap_along_rows(image: Image, grid: Array) -> float:
-    start, along = grid[1:-1, :-1], grid[1:-1, 1:] - grid[1:-1, :-1]
-    across = 0.5 * TO_QUADRANT * (grid[2:, :-1] - grid[:-2, :-1])
-    on_edge = start[..., None, :] + _NEAR_ENDS[:, None] * along[..., None, :]
-    beside = start[..., None, :] + 0.5 * along[..., None, :] + _BOTH_SIDES[:, None] * across[..., None, :]
-    sides = sample(image, beside)
-    off = np.abs(sample(image, on_edge) - sides.mean(axis=-1, keepdims=True))
+    lines = [_inner_lines(grid), _inner_lines(np.swapaxes(grid, 0, 1))]
+    start, along, across = (np.concatenate(parts)[:, None] for parts in zip(*lines, strict=True))
+    on_edge = start + _NEAR_ENDS[:, None] * along
+    beside = start + 0.5 * along + _BOTH_SIDES[:, None] * across
+    grey = sample(image, np.stack([on_edge, beside]))
+    sides = grey[1]
+    off = np.abs(grey[0] - sides.mean(axis=-1, keepdims=True))
     height = np.maximum(np.ptp(sides, axis=-1, keepdims=True), 1.0)
     return float((off / height).max())
+
+
+def _inner_lines(grid: Array) -> tuple[Array, Array, Array]:
+    """The lines along the rows but the outer ones: their starts, where they lead and how far to look beside (m, 2)."""
+    start, along = grid[1:-1, :-1], grid[1:-1, 1:] - grid[1:-1, :-1]
+    across = 0.5 * TO_QUADRANT * (grid[2:, :-1] - grid[:-2, :-1])
+    return start.reshape(-1, 2), along.reshape(-1, 2), across.reshape(-1, 2)
 
 
 def edge_blur(image: Image, grid: Array, reach: float) -> float:
@@ -68,23 +74,26 @@ def edge_blur(image: Image, grid: Array, reach: float) -> float:
     of the pixels themselves; blur beyond about 0.8 of ``reach`` is underestimated. Corners that are NaN are passed
     over; NaN if no two neighbours are seen.
     """
-    along_rows = _edge_widths(image, grid[:, :-1].reshape(-1, 2), grid[:, 1:].reshape(-1, 2), reach)
-    along_columns = _edge_widths(image, grid[:-1].reshape(-1, 2), grid[1:].reshape(-1, 2), reach)
-    medians = [float(np.median(widths)) for widths in (along_rows, along_columns) if len(widths)]
-    return max(medians, default=float("nan"))
+    starts = [grid[:, :-1].reshape(-1, 2), grid[:-1].reshape(-1, 2)]
+    ends = [grid[:, 1:].reshape(-1, 2), grid[1:].reshape(-1, 2)]
+    widths = _edge_widths(image, np.concatenate(starts), np.concatenate(ends), reach)
+    along_rows, along_columns = widths[: len(starts[0])], widths[len(starts[0]) :]
+    seen = [along[np.isfinite(along)] for along in (along_rows, along_columns)]
+    return max((statistics.median(widths.tolist()) for widths in seen if len(widths)), default=float("nan"))
 
 
 def _edge_widths(image: Image, start: Array, end: Array, reach: float) -> Array:
-    """Gaussian sigma (k,) px across the straight edges from ``start`` to ``end`` (n, 2) px, where both are seen."""
-    seen = np.isfinite(start[:, 0] + end[:, 0])
-    start, end = start[seen], end[seen]
+    """Gaussian sigma (n,) px across the straight edges from ``start`` to ``end`` (n, 2) px, NaN where one is NaN."""
     half = np.clip(np.floor(reach), 2.0, 10.0)
     across = np.arange(-half, half + 1.0)
     along = np.linspace(0.3, 0.7, 9)
-    edge = end - start
+    widths = np.full(len(start), np.nan)
+    seen = np.isfinite(start[:, 0] + end[:, 0])
+    start, edge = start[seen], (end - start)[seen]
     normal = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     on_edge = start[:, None] + along[:, None] * edge[:, None]
     profile = sample(image, on_edge[:, :, None] + across[:, None] * normal[:, None, None]).mean(axis=1)
     height = np.abs(profile[:, -1] - profile[:, 0])
     slope = np.abs(np.diff(profile, axis=1)).max(axis=1)
-    return np.asarray(height / (np.sqrt(2.0 * np.pi) * np.maximum(slope, np.finfo(float).tiny)))
+    widths[seen] = height / (np.sqrt(2.0 * np.pi) * np.maximum(slope, np.finfo(float).tiny))
+    return widths

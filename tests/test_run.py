@@ -531,11 +531,12 @@ def test_a_cell_that_its_backend_cannot_serve_is_refused_before_anything_is_writ
 
 
 def test_values_nested_too_deeply_are_refused_in_words(tmp_path):
-    (tmp_path / "cell.yaml").write_text("[" * 5000)
+    # Deeper than Python recurses. What ruamel reads ahead takes it seconds where everything is deeper still.
+    (tmp_path / "cell.yaml").write_text("[" * 700)
     (tmp_path / "captures.json").write_text("[" * 100000)
     for arguments in (
         ["run", tmp_path / "cell.yaml"],
-        ["run", PAPER, "--set", f"procedure.seed={'[' * 3000}"],
+        ["run", PAPER, "--set", f"procedure.seed={'[' * 700}"],
         ["estimate", tmp_path / "captures.json", "--cell", PAPER],
     ):
         result = dualcal(*arguments)

@@ -9,6 +9,10 @@ from pathlib import Path
 
 import pytest
 
+# Matrices are small here: a second thread of OpenBLAS only spins, and takes its time from the other worker's tests.
+# It is read when numpy is first imported, also by the processes that tests start.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 _GRACE = 1.0  # s in which a thread that was told to end may do so
 
 

@@ -36,3 +36,9 @@ def _sockets() -> set[str]:
         except FileNotFoundError:  # the descriptor of this very listing
             continue
     return {link for link in links if link.startswith("socket:")}
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs leave no picture, where a test is about something else: it takes a third of a small one."""
+    monkeypatch.setattr("tools.cli.run.draw_summary", lambda *_, **__: None)

@@ -556,6 +556,7 @@ def test_a_run_keeps_the_distances_and_prints_the_least(session: Path) -> None:
     assert f"least distance between the arms {distances.least()}" in output
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_can_be_repeated_to_the_last_bit(session: Path, tmp_path: Path) -> None:
     assert dualcal("run", PAPER, "--out", tmp_path / "again", "--seed", 3, *sets(*SMALL, BULLET)).exit_code == 0
     first, second = (

@@ -218,6 +218,7 @@ def test_a_cell_file_that_describes_no_board_is_refused(change: dict[str, str], 
     assert any(told in str(problem) for problem in refused.value.problems)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_cell_with_a_charuco_board_is_calibrated(tmp_path: Path) -> None:
     settings = [part for setting in (TARGET, *SMALL) for part in ("--set", setting)]
     done = CliRunner().invoke(app, ["run", str(PAPER), "--out", str(tmp_path / "session"), *settings])

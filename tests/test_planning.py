@@ -19,7 +19,7 @@ from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import inverse, rotation_from_vector, transform
 from procedures.calibrate import requests_of
 from procedures.planning.advice import advice
-from procedures.planning.candidates import ROOM, CandidateSource
+from procedures.planning.candidates import _AXES_AT_ONCE, ROOM, CandidateSource
 from procedures.planning.choice import LEAST_SPREAD, LEAST_TURN, Knowledge, most_informative, turned_about_two_axes
 from procedures.planning.model import CellModel, Posture
 from procedures.planning.order import shortest_order
@@ -409,12 +409,20 @@ def test_what_the_true_shapes_forbid_is_replaced_and_counted(cell, ways, plan, m
 # -- refusals --------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def few_axes_for_advice(monkeypatch):
+    """What would help is searched for with two batches of axes for each change tried, not nine: it stands out."""
+    monkeypatch.setattr("procedures.planning.poses._AXES_FOR_ADVICE", 2 * _AXES_AT_ONCE)
+
+
+@pytest.mark.usefixtures("few_axes_for_advice")
 def test_positions_without_a_clear_way_between_them_are_counted(cell, ways, monkeypatch):
     monkeypatch.setattr(WayFinder, "clear", lambda self, arm, start, waypoints: False)
     with pytest.raises(NoPlan, match=r"the way between two positions is not clear: \d\d"):
         made(cell, ways)
 
 
+@pytest.mark.usefixtures("few_axes_for_advice")
 def test_constraints_that_no_way_leads_to_are_given_up_with_what_is_in_the_way(cell, ways, monkeypatch):
     monkeypatch.setattr(WayFinder, "find", lambda self, start, goal: None)
     monkeypatch.setattr(WayFinder, "blocked_by", lambda self, start, goal: "a pillar stands there")
@@ -427,6 +435,7 @@ def test_constraints_that_no_way_leads_to_are_given_up_with_what_is_in_the_way(c
     assert why.endswith("No single change of those tried would help")
 
 
+@pytest.mark.usefixtures("few_axes_for_advice")
 def test_where_no_way_leads_to_constraints_the_change_that_opens_one_is_named(cell, ways, monkeypatch):
     """As if no way were free unless the bases stand farther apart."""
     apart = np.linalg.norm(ways._T_P_A[:3, 3])
@@ -462,6 +471,7 @@ def test_ways_missed_for_one_request_are_not_held_against_the_next(cell, ways, m
     assert plan.refused["no clear way to the constraint"] == 20
 
 
+@pytest.mark.usefixtures("few_axes_for_advice")
 def test_axes_that_cannot_spread_are_counted(cell, ways, monkeypatch):
     ask_for_more_spread_than_there_is(monkeypatch)
     with pytest.raises(NoPlan, match=r"no choice of them will do.*the axes of the best choice do not spread: 3"):
@@ -513,6 +523,7 @@ def test_of_the_changes_that_help_the_best_is_named_and_far_moves_of_the_bases_o
     assert "widen procedure.distance_mm" in more
 
 
+@pytest.mark.usefixtures("few_axes_for_advice")
 def test_a_fixture_around_an_arm_is_named_and_shall_be_moved():
     box = "at: {translation_mm: [0, 0, 0], rotation_vector_deg: [0, 0, 0]}, box_mm: [600, 600, 1500]"
     why = refused(f"fixtures={{cabinet: {{in: passive_base, {box}}}}}")

@@ -43,8 +43,9 @@ def corner_errors(renderer: Renderer, distances: Array, seed: int) -> Array:
     return np.concatenate(errors)
 
 
-def test_corners_are_where_the_distorted_camera_sees_them(renderer: Renderer) -> None:
-    errors = corner_errors(renderer, np.linspace(0.3, 0.5, 200), seed=1)
+@pytest.mark.parametrize("views", [80, pytest.param(200, marks=pytest.mark.slow)])
+def test_corners_are_where_the_distorted_camera_sees_them(renderer: Renderer, views: int) -> None:
+    errors = corner_errors(renderer, np.linspace(0.3, 0.5, views), seed=1)
     assert np.sqrt(np.mean(errors**2)) <= 0.005
     assert np.all(np.abs(errors.mean(axis=0)) <= 0.002)
     assert np.abs(errors).max() < 0.03

@@ -96,10 +96,10 @@ def main() -> None:
             print(f"{one.number:5d}  {one.kind:8s}  {plans}  {one.why}", flush=True)
     kinds = Counter(one.kind for one in outcomes)
     times = [one.plans[0] for one in outcomes if one.plans]
-    print(
-        f"{len(outcomes)} cells: {', '.join(f'{kind} {count}' for kind, count in kinds.most_common())}; "
-        f"first plan median {np.median(times):.2f}, p95 {np.percentile(times, 95):.2f}, max {np.max(times):.2f} s"
-    )
+    print(f"{len(outcomes)} cells: {', '.join(f'{kind} {count}' for kind, count in kinds.most_common())}")
+    if times:
+        p95 = np.percentile(times, 95)
+        print(f"first plan median {np.median(times):.2f}, p95 {p95:.2f}, max {np.max(times):.2f} s")
 
 
 if __name__ == "__main__":

@@ -12,8 +12,9 @@ from dualcal_hal.cellfile import load_cell
 from dualcal_hal.errors import NoPlan
 from dualcal_hal.geometry import Placement, camera_capsule
 from dualcal_hal.geometry.exact import ExactCell
-from dualcal_hal.transforms import rotation_from_vector, transform
-from procedures.planning.first_look import find_stand_off, look_postures
+from dualcal_hal.transforms import inverse, rotation_from_vector, transform
+from procedures.planning import first_look
+from procedures.planning.first_look import _MILDER, find_stand_off, look_postures
 from procedures.planning.model import CellModel, Posture
 from procedures.planning.refine import LEAST_VIEWS, View, refine
 from procedures.planning.ways import WayFinder
@@ -315,12 +316,37 @@ def test_no_look_is_taken_at_a_board_that_something_hides(model, stand_off):
         assert refused["an arm or a fixture hides the target"] >= 8
 
 
+def test_where_no_look_will_do_the_board_is_tilted_less_and_from_farther_away(model, ways, stand_off, monkeypatch):
+    """As if only postures with camera and board a decimetre farther apart than at the stand-off were clear."""
+    monkeypatch.setattr("procedures.planning.first_look._clear_postures", only_from_a_decimetre_farther(stand_off))
+    view = distance_between(model, stand_off.posture)
+    postures = list(look_postures(model, model.nominal, ways, stand_off.posture, 2))
+    assert postures
+    assert all(distance_between(model, posture) > view + 0.1 for posture in postures)
+
+
+def distance_between(model, posture):
+    T_E_T = inverse(model.camera_in_passive(posture.active, model.nominal)) @ model.target_in_passive(posture.passive)
+    return T_E_T[2, 3]
+
+
+def only_from_a_decimetre_farther(stand_off):
+    clear = first_look._clear_postures
+
+    def farther(model, belief, ways, near, cameras, boards, refused):
+        postures = clear(model, belief, ways, near, cameras, boards, refused)
+        least = distance_between(model, stand_off.posture) + 0.1
+        return [posture for posture in postures if distance_between(model, posture) > least]
+
+    return farther
+
+
 def test_postures_that_will_not_do_for_a_look_are_counted_with_the_reason(model, ways):
     home = Posture(HOME, HOME)
     refused = Counter()
     postures = list(look_postures(model, model.nominal, ways, home, 1, refused))
     assert not postures
-    assert refused["'right' does not get there"] == 8
+    assert refused["'right' does not get there"] == 8 * (1 + len(_MILDER))
 
 
 @pytest.mark.parametrize("length_mm", [20, 120])

@@ -182,6 +182,10 @@ def _looks_possible(model: CellModel, belief: Belief, ways: WayFinder, stand_off
     return tilts + _TILTS_PER_LOOK * sum(look is not None for look in looks)
 
 
+_MILDER = ((1.0, 0.06), (0.7, 0.0), (0.7, 0.06), (0.7, 0.12), (0.7, 0.25), (0.5, 0.0), (0.5, 0.12))
+"""Shares of a look's tilt, and m that camera and board are farther apart, where nothing better will do."""
+
+
 def look_postures(
     model: CellModel, belief: Belief, ways: WayFinder, at: Posture, number: int, refused: Counter[str] | None = None
 ) -> Iterator[Posture]:
@@ -190,7 +194,8 @@ def look_postures(
     Counts in ``refused`` those that failed a condition.
 
     Look 0 is the stand-off itself and, should the board not be seen there, the camera tilted about its own lens in
-    rings. Later ones tilt the board about its own centre, point the camera at it as now believed, and roll it.
+    rings. Later ones tilt the board about its own centre, point the camera at it as now believed, and roll it; less and
+    from farther away where nothing else will do.
     """
     refused = Counter() if refused is None else refused
     aimed = model.camera_in_passive(at.active, belief)
@@ -201,12 +206,35 @@ def look_postures(
         cameras = np.array([_turned(aimed, _about(azimuth, angle)) for angle, azimuth in tilts])
         yield from _clear_postures(model, belief, ways, at, cameras, np.tile(T_P_T, (len(cameras), 1, 1)), refused)
         return
-    aimed = _aimed(aimed, T_P_T[:3, 3])
+    for share, apart in ((1.0, 0.0), *_MILDER):
+        yield from _tilted_postures(model, belief, ways, at, number, refused, share=share, apart=apart)
+
+
+def _tilted_postures(
+    model: CellModel,
+    belief: Belief,
+    ways: WayFinder,
+    at: Posture,
+    number: int,
+    refused: Counter[str],
+    *,
+    share: float = 1.0,
+    apart: float = 0.0,
+) -> Iterator[Posture]:
+    """Postures with the board tilted as the look wants it and the camera leaning and rolled.
+
+    share: of the tilt; apart: m by which camera and board are farther from each other than at the stand-off.
+    """
+    T_P_T = model.target_in_passive(at.passive)
+    aimed = _aimed(model.camera_in_passive(at.active, belief), T_P_T[:3, 3])
+    axis = aimed[:3, 2].copy()
+    aimed[:3, 3] -= apart / 2 * axis
+    T_P_T[:3, 3] += apart / 2 * axis
     azimuth = np.pi / 4 + (number - 1) * np.pi / 2
     lean = _about(azimuth + np.pi / 2, CAMERA_LEAN)
     rolls = (1.0 if number % 2 else -1.0) * np.array([*_CAMERA_ROLLS, *-_CAMERA_ROLLS])
     cameras = np.array([_turned(aimed, lean @ rotation_from_vector([0.0, 0.0, roll])) for roll in rolls])
-    angle = BOARD_TILT if number <= 4 else STEEPER_TILT
+    angle = share * (BOARD_TILT if number <= 4 else STEEPER_TILT)
     boards = np.array([_tilted(T_P_T, T_P_E, azimuth, angle) for T_P_E in cameras])
     for posture in _clear_postures(model, belief, ways, at, cameras, boards, refused):
         if model.in_view(_T_E_T(model, belief, posture)[None])[0]:

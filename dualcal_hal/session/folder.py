@@ -10,6 +10,7 @@ import numpy as np
 from dualcal_hal.camera import Image
 from dualcal_hal.errors import UsageError
 from dualcal_hal.session.files import read_document, write_atomically, write_document
+from dualcal_hal.session.images import encode_png
 from dualcal_hal.session.journal import Journal
 
 
@@ -50,12 +51,7 @@ class Session:
 
     def write_image(self, name: str, image: Image) -> None:
         """Store an image losslessly and durably."""
-        import cv2
-
-        # Sensor noise does not repeat: to look for what does costs half as much again and makes the file larger.
-        strategy = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
-        _, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1, *strategy])
-        write_atomically(self.image_path(name), png.tobytes())
+        write_atomically(self.image_path(name), encode_png(image))
 
     def read_image(self, name: str) -> Image:
         """An image as it was stored; UsageError if it is not there."""

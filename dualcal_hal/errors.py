@@ -6,6 +6,10 @@
     ├── UsageError (ValueError)             a call that cannot be carried out as asked
     ├── DegenerateCaptures (ValueError)     captures that do not determine what is sought
     ├── NoPlan (RuntimeError)               no poses or no way that keep all conditions
+    ├── LogMissing (LookupError)            a folder or file that holds no log
+    ├── LogDamaged (ValueError)             a log whose bytes are not what was written
+    ├── LogTooNew (ValueError)              a log of a later version
+    ├── LogNotWritten (OSError)             a log that the disk does not take
     ├── Interrupted                         SIGINT, SIGTERM or an abort by the operator
     └── DeviceError                         names the device, what was attempted and what to do
         ├── NotOpen (RuntimeError)
@@ -67,6 +71,28 @@ class DegenerateCaptures(DualcalError, ValueError):
 
 class NoPlan(DualcalError, RuntimeError):
     """No poses or no way found; the message says which condition failed how often."""
+
+
+class LogMissing(DualcalError, LookupError):
+    """There is no log where one was looked for."""
+
+
+class LogDamaged(DualcalError, ValueError):
+    """A log is not as it was written; ``file`` says which, ``offset`` at which byte, None where that is not known."""
+
+    def __init__(self, file: str, offset: int | None, why: str) -> None:
+        self.file = file
+        self.offset = offset
+        self.why = why
+        super().__init__(f"{file}: {why}" if offset is None else f"{file}: at byte {offset}: {why}")
+
+
+class LogTooNew(DualcalError, ValueError):
+    """The log was written by a later version."""
+
+
+class LogNotWritten(DualcalError, OSError):
+    """The log cannot be written, so the run must not go on as if it were."""
 
 
 class Interrupted(DualcalError):

@@ -79,3 +79,72 @@ def schema() -> None:
         from dualcal_hal.cellfile import cell_schema
 
         typer.echo(json.dumps(cell_schema(), indent=2))
+
+
+log_app = typer.Typer(help="Look at, check, repair and export the log of a session.", no_args_is_help=True)
+app.add_typer(log_app, name="log")
+
+LogOf = Annotated[
+    Path, typer.Argument(metavar="SESSION", help="The session's folder, or one file of its log.", show_default=False)
+]
+JsonDocument = Annotated[bool, typer.Option("--json", help="Print a JSON document alone on standard output.")]
+
+
+@log_app.command()
+def info(session: LogOf, json: JsonDocument = False) -> None:
+    """Say what a log holds: topics with their counts, rates and longest gaps.
+
+    Exit code 0, 1 if it is damaged, 2 if there is none that can be used.
+    """
+    with ended_in_order():
+        from tools.cli.log import show_info
+
+        code = show_info(session, as_json=json)
+    raise typer.Exit(code)
+
+
+@log_app.command()
+def check(session: LogOf, json: JsonDocument = False) -> None:
+    """Read all of a log: checksums, times, calls with their replies, sequences, counts.
+
+    Exit code 0 if it is good, also where a run was killed; 1 if it is damaged, 2 if there is none that can be used.
+    """
+    with ended_in_order():
+        from tools.cli.log import show_check
+
+        code = show_check(session, as_json=json)
+    raise typer.Exit(code)
+
+
+@log_app.command()
+def recover(
+    session: LogOf,
+    out: Annotated[Path | None, typer.Option(help="Folder for the new files. Default: beside the old.")] = None,
+    json: JsonDocument = False,
+) -> None:
+    """Save what can be read of a damaged or unfinished log in a new file, recovered-log-NNNN.mcap; list what is lost.
+
+    The old file is not touched. Exit code 0, 1 if nothing could be saved of a file, 2 if it cannot be done.
+    """
+    with ended_in_order():
+        from tools.cli.log import recover as recover_log
+
+        code = recover_log(session, out, as_json=json)
+    raise typer.Exit(code)
+
+
+@log_app.command()
+def export(
+    session: LogOf,
+    out: Annotated[Path | None, typer.Option(help="A new folder. Default: export/ in the session.")] = None,
+    json: JsonDocument = False,
+) -> None:
+    """Write joint states and steps as CSV, frames as PNG.
+
+    Exit code 0, 1 if damage ended it early, 2 if it cannot be done.
+    """
+    with ended_in_order():
+        from tools.cli.log import export as export_log
+
+        code = export_log(session, out, as_json=json)
+    raise typer.Exit(code)

@@ -148,11 +148,12 @@ class RawFile:
             value, start = zlib.crc32(data, value), start + len(data)
         return value
 
-    def pieces(self) -> Iterator[Piece | Damage | CutOff]:
-        """The records behind the magic, by their heads alone. What is damaged is passed over to the next chunk whose
-        checksum is right; ends behind the footer, or with CutOff.
+    def pieces(self, position: int = len(MAGIC)) -> Iterator[Piece | Damage | CutOff]:
+        """The records from ``position`` on, by their heads alone.
+
+        What is damaged is passed over, to the next chunk with a right checksum. Ends behind the footer, or with CutOff.
         """
-        position, in_summary = len(MAGIC), False
+        in_summary = False
         while position < self.size:
             piece, why = self._piece(position, in_summary)
             if piece is not None:
@@ -205,12 +206,15 @@ class RawFile:
         else:
             yield Damage(position, self.size, "something else follows the footer than the end of the file")
 
-    def next_chunk(self, position: int) -> int | None:
-        """Where, from ``position`` on, the next whole chunk with a right checksum begins, or None."""
-        while position < self.size:
+    def next_chunk(self, position: int, end: int | None = None) -> int | None:
+        """Where, from ``position`` on and before ``end``, a whole chunk with a right checksum begins, or None."""
+        end = self.size if end is None else end
+        while position < end:
             window = self.read(position, min(_WINDOW + _PATTERN_LENGTH, self.size - position))
             found = 0
             while (match := _CHUNK_PATTERN.search(window, found)) is not None:
+                if position + match.start() >= end:
+                    return None
                 if self._is_chunk(position + match.start()):
                     return position + match.start()
                 found = match.start() + 1

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from dualcal_hal.errors import LogDamaged, LogNotWritten
 from dualcal_hal.session.log.framing import (
+    MAGIC,
     Channel,
     CutOff,
     Damage,
@@ -69,16 +72,25 @@ def _recover(raw: RawFile, source: Path, target: Path) -> Recovered:
     if layout is None:
         raise LogDamaged(str(source), None, "there is nothing in it that can be saved")
     rescue = _Rescue(raw, layout)
+    with _created(target) as file:
+        writer = FileWriter(file, layout)
+        rescue.copy(writer, source.name)
+        writer.finish()
+    return Recovered(target, dict(rescue.counts), tuple(rescue.losses), dict(rescue.missing))
+
+
+@contextmanager
+def _created(target: Path) -> Iterator[IO[bytes]]:
+    """A new file that is there whole or not at all; LogNotWritten."""
     try:
         with target.open("xb") as file:
-            writer = FileWriter(file, layout)
-            rescue.copy(writer, source.name)
-            writer.finish()
+            try:
+                yield file
+            except BaseException:
+                target.unlink()
+                raise
     except OSError as error:
-        if not isinstance(error, FileExistsError):
-            target.unlink(missing_ok=True)
         raise LogNotWritten(f"{target}: the log cannot be written: {error.strerror}") from error
-    return Recovered(target, dict(rescue.counts), tuple(rescue.losses), dict(rescue.missing))
 
 
 class _Rescue:
@@ -98,14 +110,26 @@ class _Rescue:
 
     def copy(self, writer: FileWriter, source: str) -> None:
         """All that can be read, in its order."""
-        for piece in self._raw.pieces():
+        position: int | None = len(MAGIC)
+        while position is not None:
+            position = self._copy_from(position, writer, source)
+        if self._about is None:
+            self._write_about(writer, {}, source)
+
+    def _copy_from(self, position: int, writer: FileWriter, source: str) -> int | None:
+        """Up to the end, or to where a chunk of a wrong length turns out to have another one in it."""
+        for piece in self._raw.pieces(position):
             try:
                 self._piece(piece, writer, source)
             except Malformed as error:
-                end = piece.end if isinstance(piece, Piece | Damage) else self._raw.size
+                within = None
+                if isinstance(piece, Piece) and piece.opcode == Opcode.CHUNK:
+                    within = self._raw.next_chunk(piece.start, piece.end)
+                end = within or (self._raw.size if isinstance(piece, CutOff) else piece.end)
                 self.losses.append(Loss(error.offset, end - error.offset, error.why))
-        if self._about is None:
-            self._write_about(writer, {}, source)
+                if within is not None:
+                    return within
+        return None
 
     def _piece(self, piece: Piece | Damage | CutOff, writer: FileWriter, source: str) -> None:
         match piece:

@@ -138,7 +138,7 @@ def main() -> None:
     outcomes: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
         sample, mutated, recovered = (Path(folder) / name for name in ("log-0001.mcap", "mutated.mcap", "new.mcap"))
-        write_sample(sample)
+        write_sample(sample, points=4)
         content = sample.read_bytes()
         for number in range(arguments.count):
             mutated.write_bytes(mutate(content, chance))

@@ -1,0 +1,247 @@
+"""The writer: what is handed over is written, durable when it says so, and a failing disk is told, never waited for."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+
+import numpy as np
+import pytest
+
+from dualcal_hal.camera import Frame
+from dualcal_hal.errors import LogNotWritten
+from dualcal_hal.robot import Mode, RobotState
+from dualcal_hal.session.images import encode_png
+from dualcal_hal.session.log import Call, FrameRef, LogReader, LogWriter, Note, Picture, Reply, Worked, writer
+from tools.benchmarks.mutated_logs import STARTED
+
+IMAGES = np.random.default_rng(1).integers(0, 256, (8, 40, 50), dtype=np.uint8)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "log-0001.mcap"
+
+
+def open_log(path, **options):
+    return LogWriter(path, STARTED, arms=("left", "right"), **options)
+
+
+def items(path):
+    with LogReader(path) as reader:
+        return list(reader.items()), reader.ending
+
+
+def test_what_is_handed_over_comes_back_in_its_order(path):
+    with open_log(path) as log:
+        for number, image in enumerate(IMAGES):
+            log.record(Call("camera", number, "grab", {}, float(number)))
+            log.frame(Frame(image, number + 0.25, number))
+            log.record(Reply("camera", number, FrameRef("camera", number, number + 0.25), number + 0.5))
+    found, ending = items(path)
+    assert ending.finished
+    assert [type(item).__name__ for item in found] == ["Call", "Picture", "Reply"] * len(IMAGES)
+    for number, picture in enumerate(item for item in found if isinstance(item, Picture)):
+        assert picture.sequence == number
+        assert np.array_equal(picture.decode(), IMAGES[number])
+
+
+def test_what_is_synced_is_on_the_disk_whatever_comes_then(path, monkeypatch):
+    synced = []
+    fsync = os.fsync
+    monkeypatch.setattr("os.fsync", lambda number: (fsync(number), synced.append(path.read_bytes())))
+    with open_log(path) as log:
+        log.record(Note("info", "first", 1.0))
+        log.frame(Frame(IMAGES[0], 1.5, 0))
+        log.sync()
+        killed = path.with_name("killed.mcap")
+        killed.write_bytes(synced[-1])
+        log.record(Note("info", "second", 2.0))
+    found, ending = items(killed)
+    assert not ending.finished
+    assert [type(item).__name__ for item in found] == ["Note", "Picture"]
+
+
+def test_many_threads_may_write(path):
+    def write(log, device):
+        for index in range(50):
+            log.record(Call(device, index, "read", {}, float(index)))
+
+    with open_log(path) as log:
+        threads = [threading.Thread(target=write, args=(log, name)) for name in ("left", "right", "camera")]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    found, _ = items(path)
+    for name in ("left", "right", "camera"):
+        assert [call.index for call in found if call.device == name] == list(range(50))
+
+
+class Gate:
+    """A disk that takes nothing until it is told to."""
+
+    def __init__(self, monkeypatch):
+        self.open = threading.Event()
+        write = writer.FileWriter.write
+        monkeypatch.setattr(
+            writer.FileWriter, "write", lambda self_, *args: (self.open.wait(10), write(self_, *args))[1]
+        )
+
+
+def test_a_disk_that_is_behind_slows_the_run_and_drops_nothing(path, monkeypatch):
+    gate = Gate(monkeypatch)
+    monkeypatch.setattr(writer, "LARGEST_BACKLOG", 3 * IMAGES[0].nbytes)
+    told = []
+    with open_log(path, on_slow=told.append) as log:
+        timer = threading.Timer(0.3, gate.open.set)
+        timer.start()
+        for number, image in enumerate(IMAGES):
+            log.frame(Frame(image, float(number), number))
+        timer.join()
+        assert log.slowed >= 0.1
+        assert told == [pytest.approx(log.slowed, abs=0.2)], "it is told once, not for each frame"
+    found, _ = items(path)
+    assert [picture.sequence for picture in found] == list(range(len(IMAGES)))
+
+
+def test_one_that_is_larger_than_the_backlog_is_taken_alone(path, monkeypatch):
+    monkeypatch.setattr(writer, "LARGEST_BACKLOG", 10)
+    with open_log(path) as log:
+        log.frame(Frame(IMAGES[0], 0.0, 0))
+        log.frame(Frame(IMAGES[1], 1.0, 1))
+    assert len(items(path)[0]) == 2
+
+
+@pytest.mark.parametrize("call", ["record", "sync", "frame"])
+def test_a_full_disk_is_told_at_the_next_call_with_the_files_name(path, monkeypatch, call):
+    def full(self, *args):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    log = open_log(path)
+    monkeypatch.setattr(writer.FileWriter, "write", full)
+    with pytest.raises(LogNotWritten, match=r"log-0001\.mcap: the log cannot be written: No space left"):
+        _write_on(log, call)
+    with pytest.raises(LogNotWritten, match="No space left"):
+        log.sync()
+    log.close()
+
+
+def _write_on(log, call):
+    while True:
+        if call == "frame":
+            log.frame(Frame(IMAGES[0], 0.0, 0))
+        else:
+            log.record(Note("info", "x", 0.0))
+        if call == "sync":
+            log.sync()
+
+
+def test_a_disk_that_fills_up_while_somebody_waits_lets_go_of_him(path, monkeypatch):
+    begun = threading.Event()
+
+    def fail_late(self, *args):
+        begun.wait(10)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(writer.FileWriter, "write", fail_late)
+    monkeypatch.setattr(writer, "LARGEST_BACKLOG", 1)
+    log = open_log(path)
+    log.frame(Frame(IMAGES[0], 0.0, 0))
+    timer = threading.Timer(0.2, begun.set)
+    timer.start()
+    with pytest.raises(LogNotWritten):
+        log.frame(Frame(IMAGES[1], 0.0, 1))
+    timer.join()
+    log.close()
+
+
+def test_a_disk_that_fails_at_the_end_is_told_by_close(path, monkeypatch):
+    log = open_log(path)
+    monkeypatch.setattr("os.fsync", _fail_to_sync)
+    with pytest.raises(LogNotWritten, match="Input/output error"):
+        log.close()
+    log.close()
+
+
+def _fail_to_sync(number):
+    raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
+def test_a_thread_that_dies_of_something_else_hangs_nobody(path, monkeypatch):
+    monkeypatch.setattr(writer, "encode", lambda *_: 1 / 0)
+    log = open_log(path)
+    log.frame(Frame(IMAGES[0], 0.0, 0))
+    with pytest.raises(LogNotWritten, match="ZeroDivisionError"):
+        log.sync()
+    log.close()
+
+
+def test_a_file_that_exists_is_not_touched(path):
+    path.write_bytes(b"precious")
+    with pytest.raises(LogNotWritten, match=r"log-0001\.mcap: .*File exists"):
+        open_log(path)
+    assert path.read_bytes() == b"precious"
+
+
+def test_a_folder_that_is_not_there_is_told_at_once(tmp_path):
+    with pytest.raises(LogNotWritten, match="No such file or directory"):
+        open_log(tmp_path / "nowhere" / "log-0001.mcap")
+
+
+def test_a_closed_log_takes_nothing(path):
+    log = open_log(path)
+    log.close()
+    with pytest.raises(LogNotWritten, match="closed"):
+        log.record(Note("info", "late", 0.0))
+    with pytest.raises(LogNotWritten, match="closed"):
+        log.sync()
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((4, 4, 3), np.uint8),
+        np.zeros((4, 4), np.float64),
+        np.zeros((0, 4), np.uint8),
+        np.zeros((1, 1 << 15), np.uint8),
+    ],
+)
+def test_what_could_not_be_read_again_is_refused(path, image):
+    with open_log(path) as log, pytest.raises(ValueError, match=r"a frame is|too large"):
+        log.frame(Frame(image, 0.0, 0))
+
+
+def test_a_record_too_large_to_be_read_is_refused(path, monkeypatch):
+    monkeypatch.setattr(writer, "LONGEST_RECORD", 1000)
+    with open_log(path) as log, pytest.raises(ValueError, match=r"Worked of .* too large"):
+        log.record(Worked(0, "plan", "x" * 1000, 0.0))
+
+
+@pytest.mark.parametrize("time", [float("nan"), float("inf"), -1e30, 1e30])
+def test_a_device_without_a_sensible_time_does_not_end_the_log(path, time):
+    with open_log(path) as log:
+        log.joint_states("left", RobotState((0.1,), (0.0,), Mode.READY, (), time, 0))
+        log.record(Reply("left", 0, RobotState((0.1,), (0.0,), Mode.READY, (), time, 0), 1.0))
+    found, _ = items(path)
+    assert str(found[1].value.time) == str(time)
+
+
+def test_the_image_is_coded_as_the_sessions_images_are(path):
+    with open_log(path) as log:
+        log.frame(Frame(IMAGES[0], 0.0, 0))
+    assert items(path)[0][0].data == encode_png(IMAGES[0])
+
+
+def test_what_the_log_is_of_stands_at_its_beginning(path):
+    with open_log(path, metadata={"cell": "tiny", "numpy": "2.4"}, clock_started=1 / 3) as log:
+        log.metadata("more", {"a": "b"})
+        log.attach("cell.yaml", "application/yaml", b"name: tiny\n", 1.0)
+    with LogReader(path) as reader:
+        about = reader.about()
+        assert (about["format"], about["cell"], about["frames"]) == ("dualcal.log/1", "tiny", "png")
+        assert float(about["clock_started_s"]) == 1 / 3
+        assert reader.layout().arms == ("left", "right")
+        assert reader.metadata()["more"] == {"a": "b"}
+        assert [(kept.name, kept.data) for kept in reader.attachments()] == [("cell.yaml", b"name: tiny\n")]

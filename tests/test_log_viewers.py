@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
 
 import cv2
 import numpy as np
@@ -119,3 +121,11 @@ def test_every_topic_has_its_schema(tmp_path):
         assert json.loads(by_topic[topic].data)["type"] == "object"
     assert by_topic["/right/joint_states"].name == "foxglove.JointStates"
     assert {schema.encoding for topic, schema in by_topic.items() if not topic.startswith("/dualcal")} == {"protobuf"}
+
+
+@pytest.mark.skipif(shutil.which("rerun") is None, reason="rerun is not installed")
+def test_rerun_finds_nothing_wrong_with_it(tmp_path):
+    path = tmp_path / "log-0001.mcap"
+    write_sample(path)
+    done = subprocess.run(["rerun", "mcap", "check", path], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr

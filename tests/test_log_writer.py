@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -165,6 +167,15 @@ def test_a_disk_that_fails_at_the_end_is_told_by_close(path, monkeypatch):
     log.close()
 
 
+def test_a_failure_that_no_call_came_upon_is_told_by_close(path, monkeypatch):
+    monkeypatch.setattr(writer, "encode", lambda *_: 1 / 0)
+    log = open_log(path)
+    log.frame(Frame(IMAGES[0], 0.0, 0))
+    log._thread.join()
+    with pytest.raises(LogNotWritten, match="ZeroDivisionError"):
+        log.close()
+
+
 def _fail_to_sync(number):
     raise OSError(errno.EIO, os.strerror(errno.EIO))
 
@@ -245,3 +256,35 @@ def test_what_the_log_is_of_stands_at_its_beginning(path):
         assert reader.layout().arms == ("left", "right")
         assert reader.metadata()["more"] == {"a": "b"}
         assert [(kept.name, kept.data) for kept in reader.attachments()] == [("cell.yaml", b"name: tiny\n")]
+
+
+_FILL = """
+import resource, sys
+import numpy as np
+from pathlib import Path
+from dualcal_hal.camera import Frame
+from dualcal_hal.errors import LogNotWritten
+from dualcal_hal.session.log import LogWriter
+from tools.benchmarks.mutated_logs import STARTED
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+image = np.random.default_rng(1).integers(0, 256, (100, 100), dtype=np.uint8)
+log = LogWriter(Path(sys.argv[1]), STARTED, arms=("left",))
+try:
+    for number in range(1000):
+        log.frame(Frame(image, float(number), number))
+        log.sync()
+        print(number)
+except LogNotWritten as error:
+    print(error)
+log.close()
+"""
+
+
+def test_what_was_synced_before_a_disk_took_no_more_is_there(path):
+    """A real one, as far as the process can tell: it takes a part of a chunk and then nothing."""
+    done = subprocess.run([sys.executable, "-c", _FILL, path], capture_output=True, text=True, check=True)
+    *numbers, told = done.stdout.splitlines()
+    assert told == f"{path}: the log cannot be written: File too large"
+    found, ending = items(path)
+    assert not ending.finished
+    assert [picture.sequence for picture in found] == [int(number) for number in numbers] != []

@@ -136,6 +136,7 @@ class LogWriter:
         self._waiting = 0
         self._change = threading.Condition()
         self._failure: BaseException | None = None
+        self._failure_told = False
         self._closing = False
         layout = Layout(tuple(arms), camera)
         about = {
@@ -151,6 +152,7 @@ class LogWriter:
             self._writer = FileWriter(self._file, layout)
             self._writer.write_metadata(METADATA_NAME, about)
             self._file.flush()
+            _sync_folder(path.parent)
         except OSError as error:
             self._release(error)
             raise self._not_written(error) from error
@@ -235,16 +237,15 @@ class LogWriter:
         self._raise_failure()
 
     def close(self) -> None:
-        """Write what is left and finish the file. Any number of times; raises what the disk refused, once."""
+        """Write what is left and finish the file. Any number of times; raises LogNotWritten if nobody was told yet."""
         with self._change:
             if self._closing:
                 return
             self._closing = True
-            failed_before = self._failure
             self._change.notify_all()
         self._thread.join()
-        if self._failure is not None and failed_before is None:
-            raise self._not_written(self._failure) from self._failure
+        if not self._failure_told:
+            self._raise_failure()
 
     # Between the threads
 
@@ -292,6 +293,7 @@ class LogWriter:
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
+            self._failure_told = True
             raise self._not_written(self._failure) from self._failure
 
     def _not_written(self, error: BaseException) -> LogNotWritten:
@@ -339,6 +341,15 @@ def _create(path: Path) -> IO[bytes]:
         return path.open("xb")
     except OSError as error:
         raise LogNotWritten(f"{path}: the log cannot be written: {error.strerror}") from error
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a new file's name as durable as what will be synced into it."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _require_size(name: str, data: Any) -> None:

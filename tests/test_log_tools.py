@@ -19,6 +19,7 @@ from dualcal_hal.robot import Mode, MotionState, RobotState
 from dualcal_hal.session.log import (
     Call,
     FrameRef,
+    Layout,
     LogReader,
     LogWriter,
     MotionEnded,
@@ -87,6 +88,17 @@ def test_every_flipped_bit_of_a_finished_log_is_found(path, sample):
         path.write_bytes(bytes(data))
         with suppress(LogTooNew):
             assert not check_log(path).good, place
+
+
+def test_all_damage_is_found_and_what_is_behind_it_is_counted(path):
+    places = [piece.offset for piece in chunks(path)[2:5:2]]
+    for place in places:
+        flip(path, place + 200)
+    checked = check_log(path)
+    found = [finding.offset for finding in checked.findings if "checksum of the chunk" in finding.what]
+    assert found == places
+    assert checked.messages["/camera/image"] == POINTS - 2
+    assert "/dualcal/work: sequence 3 where 2 is due" in [finding.what for finding in checked.findings]
 
 
 def test_a_log_that_was_never_finished_is_good_up_to_there(path, sample):
@@ -212,6 +224,27 @@ def test_metadata_and_attachments_are_kept(path, tmp_path):
         assert reader.about()["recovered_from"] == "log-0001.mcap"
     with (tmp_path / "new.mcap").open("rb") as file:
         assert make_reader(file, validate_crcs=True).get_summary().statistics.message_count > 40
+
+
+@pytest.mark.parametrize("arms", [[], ["left"], ["left", "right"], ["a"] * 16])
+def test_devices_determine_the_channels(arms):
+    layout = Layout(tuple(arms), "camera")
+    assert Layout.from_text(layout.to_text()) == layout
+    assert Layout.of_topics([channel.topic for channel in layout.channels()]) == layout
+    assert [channel.number for channel in layout.channels()] == list(range(1, 13 + len(arms)))
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"arms": 3, "camera": "c"}', '{"arms": [1], "camera": "c"}'])
+def test_devices_that_are_none_are_refused(text):
+    with pytest.raises(ValueError, match=r"\w"):
+        Layout.from_text(text)
+
+
+def test_more_arms_than_there_are_anywhere_are_refused():
+    with pytest.raises(ValueError, match="17 arms are too many"):
+        Layout.from_text(json.dumps({"arms": ["a"] * 17, "camera": "c"}))
+    with pytest.raises(ValueError, match="17 arms are too many"):
+        Layout.of_topics(["/a/joint_states"] * 17)
 
 
 def test_nothing_is_saved_where_there_is_nothing(tmp_path):

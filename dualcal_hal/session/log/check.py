@@ -8,7 +8,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dualcal_hal.errors import LogDamaged
-from dualcal_hal.session.log.framing import DataEnd, Footer, Malformed, Message, Opcode, Piece, Statistics, parse
+from dualcal_hal.session.log.framing import (
+    Channel,
+    CutOff,
+    Damage,
+    DataEnd,
+    Footer,
+    Malformed,
+    Message,
+    Opcode,
+    Piece,
+    Statistics,
+    chunk_records,
+    parse,
+    parse_attachment,
+    records_in,
+)
 from dualcal_hal.session.log.layout import arm_of, camera_of
 from dualcal_hal.session.log.reader import Ending, Item, LogReader, Picture
 from dualcal_hal.session.log.records import Call, FrameRef, MotionEnded, Reply, StepBegun, StepFinished, Worked
@@ -55,36 +70,69 @@ class _Check:
         self._pairs = _Pairs()
         self._sequences: dict[str, int] = {}
         self._newest = 0
+        self._topics: dict[int, str] = {}
 
     def run(self) -> Checked:
         ending = None
         try:
             with LogReader(self._path) as reader:
-                reader.about()
-                for topic, message in reader.messages():
-                    self._message(reader, topic, message)
-                for _ in reader.attachments():
-                    pass
-                ending = reader.ending
-                if ending is not None and ending.finished:
+                # Numbers of channels follow from the devices: a lost list of them makes no message unreadable.
+                self._topics = {channel.number: channel.topic for channel in reader.layout().channels()}
+                ending = self._walk(reader)
+                if ending.finished:
                     self._checksums(reader)
         except LogDamaged as error:
             self._damage(error.why, error.offset)
-        if ending is not None and not ending.finished:
+        finished = ending is not None and ending.finished
+        if ending is not None and not finished:
             self._findings.append(Finding("the file was never finished: it ends here", False, ending.offset))
-        self._findings += self._pairs.findings(finished=ending is not None and ending.finished)
+        self._findings += self._pairs.findings(finished=finished)
         return Checked(self._path, dict(self._counts), ending, tuple(self._findings))
+
+    def _walk(self, reader: LogReader) -> Ending:
+        """All records, those behind damage too; where the file ends."""
+        for piece in reader.raw.pieces():
+            match piece:
+                case Damage(offset, _, why):
+                    self._damage(why, offset)
+                case CutOff(offset):
+                    return Ending(offset, finished=False)
+                case Piece():
+                    try:
+                        self._piece(reader, piece)
+                    except Malformed as error:
+                        self._damage(error.why, error.offset)
+        return Ending(reader.raw.size, finished=True)
+
+    def _piece(self, reader: LogReader, piece: Piece) -> None:
+        if piece.opcode == Opcode.ATTACHMENT:
+            parse_attachment(reader.raw.content(piece), piece.offset)
+        if piece.opcode == Opcode.CHUNK:
+            records = chunk_records(reader.raw.content(piece), piece.offset)
+            for record in records_in(records, piece.end - len(records)):
+                if isinstance(record, Channel):
+                    self._topics[record.id] = record.topic
+                else:
+                    self._message(reader, record)
 
     def _damage(self, what: str, offset: int | None) -> None:
         self._findings.append(Finding(what, True, offset))
 
-    def _message(self, reader: LogReader, topic: str, message: Message) -> None:
+    def _message(self, reader: LogReader, message: Message) -> None:
+        topic = self._topics.get(message.channel)
+        if topic is None:
+            self._damage(f"a message is on channel {message.channel}, which is not known", message.offset)
+            return
         self._counts[topic] += 1
         if message.log_time < self._newest:
             self._damage(f"{topic}: time goes back", message.offset)
         self._newest = max(self._newest, message.log_time)
         self._sequence(topic, message)
-        item = reader.item(topic, message)
+        try:
+            item = reader.item(topic, message)
+        except LogDamaged as error:
+            self._damage(error.why, error.offset)
+            return
         if item is not None:
             for what in self._pairs.add(item):
                 self._damage(what, message.offset)
@@ -128,7 +176,7 @@ class _Check:
 
 
 def _tail(reader: LogReader) -> tuple[Piece | None, Piece | None, Piece | None]:
-    last = {piece.opcode: piece for piece in reader.pieces()}
+    last = {piece.opcode: piece for piece in reader.raw.pieces() if isinstance(piece, Piece)}
     return last.get(Opcode.DATA_END), last.get(Opcode.FOOTER), last.get(Opcode.STATISTICS)
 
 

@@ -26,6 +26,9 @@ METADATA_NAME = "dualcal.log"
 LARGEST_RECORD = 1 << 26
 """Bytes of one record of the file, so of a message, a chunk or an attachment."""
 
+MOST_ARMS = 16
+"""A log that names more is none."""
+
 RECORD_TOPICS: dict[type[Record], str] = {
     Call: "/dualcal/calls",
     Reply: "/dualcal/replies",
@@ -88,6 +91,10 @@ class Layout:
     arms: tuple[str, ...]
     camera: str
 
+    def __post_init__(self) -> None:
+        if len(self.arms) > MOST_ARMS:
+            raise ValueError(f"{len(self.arms)} arms are too many")
+
     def channels(self) -> list[Channel]:
         """All of them, in the order of their numbers, which begin with 1."""
         from dualcal_hal.session.log import foxglove
@@ -121,7 +128,7 @@ class Layout:
 
     @staticmethod
     def of_topics(topics: list[str]) -> Layout:
-        """From the topics of a file."""
+        """From the topics of a file; ValueError for more than any has."""
         arms = tuple(arm for topic in topics if (arm := arm_of(topic)) is not None)
         cameras = [camera for topic in topics if (camera := camera_of(topic)) is not None]
         return Layout(arms, cameras[0] if cameras else "camera")

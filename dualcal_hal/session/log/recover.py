@@ -31,6 +31,8 @@ from dualcal_hal.session.log.layout import METADATA_NAME, PROFILE, Layout
 from dualcal_hal.session.log.reader import LogReader, item_of
 from dualcal_hal.session.log.writer import FileWriter
 
+_MOST_TOPICS = 1000
+
 
 @dataclass(frozen=True)
 class Loss:
@@ -202,14 +204,17 @@ def _layout(raw: RawFile) -> Layout | None:
                 topics = _topics_in(raw, piece)
                 if topics:
                     return Layout.of_topics(topics)
-            elif piece.opcode == Opcode.CHANNEL:
+            elif piece.opcode == Opcode.CHANNEL and len(at_end) < _MOST_TOPICS:
                 at_end.append(parse(Channel, raw.content(piece), piece.offset).topic)
             elif piece.opcode == Opcode.METADATA and stated is None:
                 group = parse(Metadata, raw.content(piece), piece.offset)
                 stated = Layout.from_text(group.metadata.get("devices", ""))
         except ValueError:
             continue
-    return Layout.of_topics(at_end) if at_end else stated
+    try:
+        return Layout.of_topics(at_end) if at_end else stated
+    except ValueError:
+        return stated
 
 
 def _topics_in(raw: RawFile, piece: Piece) -> list[str]:

@@ -18,6 +18,7 @@ from dualcal_hal.guard import CellGuard, GuardedRobot, JointLimits
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.registry import backend_class
 from dualcal_hal.robot import Joints
+from dualcal_hal.session.log.recording import Recording
 
 OPEN_TIMEOUT = 10.0
 """Seconds that a backend may take to open."""
@@ -48,20 +49,26 @@ class Cell:
         self._backends = {name: backend_class(type_)(name, cell) for name, type_ in types.items()}
         self.clock = _common_clock(self._backends)
         self._devices = ExitStack()
+        self._recording = Recording()
         self.active: Arm
         self.passive: Arm
         self.camera: Camera
         self.guard: CellGuard
+
+    def record(self, recording: Recording) -> None:
+        """Have all that passes between this program and the devices told to ``recording``; before they are opened."""
+        self._recording = recording
 
     def __enter__(self) -> Self:
         with ExitStack() as opening:
             for backend in self._backends.values():
                 opening.callback(backend.close)
                 backend.open(OPEN_TIMEOUT)
+            opening.callback(self._recording.leave)
             config = self._file.cell
             self.active = self._arm(config.active_name, config.active)
             self.passive = self._arm(config.passive_name, config.passive)
-            self.camera = self._backends[config.camera.backend].camera(CAMERA_NAME)
+            self.camera = self._recording.camera(self._backends[config.camera.backend].camera(CAMERA_NAME))
             shapes, nominal = CellGeometry.of(config), config.nominal.placement
             self.guard = CellGuard(self.active.robot, self.passive.robot, shapes, nominal, config.procedure.clearance)
             self._devices = opening.pop_all()
@@ -81,13 +88,18 @@ class Cell:
         return {name: document for backend in self._backends.values() for name, document in backend.documents().items()}
 
     @property
+    def recording(self) -> Recording:
+        """What is told of all that happens."""
+        return self._recording
+
+    @property
     def simulated(self) -> bool:
         """Whether no real device stands behind any backend."""
         return all(backend.simulated for backend in self._backends.values())
 
     def _arm(self, name: str, config: RobotConfig) -> Arm:
         limits = JointLimits(config.lower, config.upper, config.speed, config.acceleration)
-        robot = GuardedRobot(self._backends[config.backend].robot(name), limits, self.clock)
+        robot = GuardedRobot(self._recording.robot(self._backends[config.backend].robot(name)), limits, self.clock)
         return Arm(robot, config.chain, limits, tuple(map(float, config.home)), config.encoder_sigma)
 
 

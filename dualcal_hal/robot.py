@@ -86,6 +86,16 @@ class Motion:
     def state(self) -> MotionState:
         return self._state
 
+    @property
+    def final(self) -> RobotState | None:
+        """The state in which the arm settled, None as long as it has not."""
+        return self._final
+
+    @property
+    def error(self) -> DualcalError | None:
+        """Why the motion ended without having settled, None as long as it has not."""
+        return self._error
+
     def on_end(self, listener: Callable[[], None]) -> None:
         """Call ``listener`` when the motion has ended, on the device's thread; at once if it has."""
         with self._lock:
@@ -115,17 +125,18 @@ class Motion:
 
     def settle(self, final: RobotState) -> None:
         """The arm stands at the last waypoint (called by the backend)."""
-        self._end(MotionState.SETTLED, final, None)
+        self.end(MotionState.SETTLED, final, None)
 
     def stop(self, reason: str) -> None:
         """The arm was stopped on the way (called by the backend)."""
-        self._end(MotionState.STOPPED, None, MotionStopped(self._device, "move", f"stopped: {reason}"))
+        self.end(MotionState.STOPPED, None, MotionStopped(self._device, "move", f"stopped: {reason}"))
 
     def fail(self, why: str, advice: str = "", kind: type[MotionFailed] = MotionFailed) -> None:
         """A fault ended the motion (called by the backend)."""
-        self._end(MotionState.FAILED, None, kind(self._device, "move", why, advice))
+        self.end(MotionState.FAILED, None, kind(self._device, "move", why, advice))
 
-    def _end(self, state: MotionState, final: RobotState | None, error: DualcalError | None) -> None:
+    def end(self, state: MotionState, final: RobotState | None, error: DualcalError | None) -> None:
+        """The motion has ended so; what comes after its first end changes nothing (called by the backend)."""
         with self._lock:
             if self._state is not MotionState.RUNNING:
                 return

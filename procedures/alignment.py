@@ -19,12 +19,13 @@ from dualcal_hal.transforms import Array, inverse, rotation_angle, transform
 from procedures.analysis import FARTHEST_ALIGNED
 from procedures.detection import Detection, Detector, Miss, Missed, board_poses
 from procedures.estimation.projection import undistort
+from procedures.going import go
 from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel, Posture
 from procedures.planning.refine import arrival_scatter
 from procedures.planning.ways import WayFinder
 from procedures.seeing import see
-from procedures.steps import Procedure, Sighting, move, read
+from procedures.steps import Procedure, Sighting
 
 MOST_FRAMES = 12
 LONGEST_STEP = 0.3
@@ -199,9 +200,11 @@ class Aligner:
         reply = Alignment(Outcome.NOT_CONVERGED, 0, None)
         while frames < MOST_FRAMES:
             joints = self._reach(goal, near)
-            blocked = "not reached by the passive arm" if joints is None else (yield from self._go(active, joints))
-            if joints is None or blocked:
-                return Alignment(Outcome.OUT_OF_REACH, frames, reply.offset, blocked, arrivals=arrivals)
+            if joints is None:
+                why = "not reached by the passive arm"
+                return Alignment(Outcome.OUT_OF_REACH, frames, reply.offset, why, arrivals=arrivals)
+            if not (yield from go(self._ways, Posture(active, joints))):
+                return Alignment(Outcome.OUT_OF_REACH, frames, reply.offset, "no clear way", arrivals=arrivals)
             near = joints
             picture = yield from see(self._model, self._detector, self._belief)
             frames += 1
@@ -233,20 +236,6 @@ class Aligner:
         arm = self._model.passive
         q, reached = arm.chain.inverse(T_P_T @ inverse(self._model.T_F_T), [near], arm.lower, arm.upper)
         return tuple(map(float, q[0])) if reached[0] else None
-
-    def _go(self, active: Joints, passive: Joints) -> Procedure[str]:
-        """Move both arms there; returns why it is not possible, or nothing."""
-        readings = yield from read()
-        here = Posture(
-            readings.active.commanded or readings.active.state.positions,
-            readings.passive.commanded or readings.passive.state.positions,
-        )
-        way = self._ways.find(here, Posture(active, passive))
-        if way is None:
-            return "no clear way"
-        for leg in way:
-            yield from move(leg.arm, *leg.waypoints)
-        return ""
 
     def _lateral(self, sighting: Sighting, seen: Detection) -> tuple[Array, Servo]:
         """The feature's offset across the axis (2,) in m, and the constraint's servo."""

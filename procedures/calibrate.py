@@ -22,6 +22,7 @@ from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Rejected
 from dualcal_hal.transforms import Array
 from procedures.alignment import Aligner, Alignment, AxisTrack, Outcome, point_on_axis, target_on_axis, tolerance_px
 from procedures.detection import Detector
+from procedures.detection.outcome import corners_from_record, corners_to_record
 from procedures.events import (
     BeliefRefined,
     ConstraintDone,
@@ -32,6 +33,7 @@ from procedures.events import (
     PlanReady,
     PointDone,
 )
+from procedures.going import go, here
 from procedures.planning.advice import counted
 from procedures.planning.belief import Belief
 from procedures.planning.candidates import ROOM
@@ -43,7 +45,7 @@ from procedures.planning.refine import LEAST_VIEWS, WORST_FIT, View, arrival_sca
 from procedures.planning.sight import require_visible
 from procedures.planning.ways import WayFinder
 from procedures.seeing import see
-from procedures.steps import Believe, KeepDocument, KeepImage, Procedure, move, read, task, tell
+from procedures.steps import Believe, KeepDocument, KeepImage, Procedure, task, tell, work
 
 _TRIES_A_LOOK = 20
 NO_WAY_TO_LOOK = "no clear way leads there"
@@ -61,11 +63,11 @@ class StandOffRecord:
     posture: Posture
 
     def to_record(self) -> dict[str, Any]:
-        return {"active_rad": self.posture.active, "passive_rad": self.posture.passive}
+        return self.posture.to_record()
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
-        return cls(Posture(tuple(record["active_rad"]), tuple(record["passive_rad"])))
+        return cls(Posture.from_record(record))
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,16 +186,27 @@ class Calibration:
             yield from tell(NominalContradicted(*excess))
 
     def _stand_off(self) -> Procedure[StandOffRecord]:
-        here = yield from self._here()
-        found = find_stand_off(self._model, self._belief, self._ways, here, self._procedure.seed)
-        return StandOffRecord(found.posture)
+        start = yield from here()
+
+        def find() -> StandOffRecord:
+            found = find_stand_off(self._model, self._belief, self._ways, start, self._procedure.seed)
+            return StandOffRecord(found.posture)
+
+        asked = {"from": start.to_record()}
+        return (yield from work("stand-off", asked, find, StandOffRecord.to_record, StandOffRecord.from_record))
 
     def _look(self, stand_off: Posture, number: int) -> Procedure[LookRecord]:
         reason, taken = "no posture for it keeps clear and shows the target", 0
         refused: Counter[str] = Counter()
         postures = look_postures(self._model, self._belief, self._ways, stand_off, number, refused)
-        for posture in itertools.islice(postures, _TRIES_A_LOOK):
-            if not (yield from self._go(posture)):
+        for number_of_try in range(_TRIES_A_LOOK):
+            asked = {"look": number, "try": number_of_try}
+            posture = yield from work(
+                "look posture", asked, lambda: next(postures, None), _posture_record, _posture_from
+            )
+            if posture is None:
+                break
+            if not (yield from go(self._ways, posture)):
                 refused[NO_WAY_TO_LOOK] += 1
                 continue
             picture = yield from see(self._model, self._detector, self._belief)
@@ -211,10 +224,15 @@ class Calibration:
     # -- constraints --------------------------------------------------------------------------------------------
 
     def _select(self, requests: list[Request], purpose: str) -> Procedure[Plan]:
-        here = yield from self._here()
-        seed = [self._procedure.seed, *purpose.encode()]
-        planner = PosePlanner(self._model, self._belief, self._ways, seed)
-        return planner.plan(requests, here, provisional=False)
+        start = yield from here()
+
+        def plan() -> Plan:
+            seed = [self._procedure.seed, *purpose.encode()]
+            planner = PosePlanner(self._model, self._belief, self._ways, seed)
+            return planner.plan(requests, start, provisional=False)
+
+        asked = {"from": start.to_record(), "for": purpose}
+        return (yield from work("plan", asked, plan, Plan.to_record, Plan.from_record))
 
     def _adopt_plan(self, plan: Plan) -> Procedure[None]:
         self._plan = plan
@@ -305,7 +323,7 @@ class Calibration:
                 active_joints=sighting.active,
                 passive_joints=sighting.passive,
                 feature=(float(seen.feature[0]), float(seen.feature[1])),
-                corners=_pixels(seen.corners),
+                corners=corners_to_record(seen.corners),
                 image_size=self._model.intrinsics.size,
                 aligned=alignment.outcome is Outcome.ALIGNED,
                 order_known=seen.order_known,
@@ -350,26 +368,12 @@ class Calibration:
         self._belief = belief
         self._model = self._model.believing(belief)
         self._ways = WayFinder(self._model, belief, self._retreats)
-        yield Believe(belief.placement, self._model.geometry)
-
-    def _here(self) -> Procedure[Posture]:
-        readings = yield from read()
-        return Posture(
-            readings.active.commanded or readings.active.state.positions,
-            readings.passive.commanded or readings.passive.state.positions,
-        )
-
-    def _go(self, goal: Posture) -> Procedure[bool]:
-        """Move both arms to a posture; says whether there was a clear way."""
-        way = self._ways.find((yield from self._here()), goal)
-        for leg in way or ():
-            yield from move(leg.arm, *leg.waypoints)
-        return way is not None
+        yield Believe(belief.placement, self._model.geometry, belief.T_H_E)
 
     def _go_home(self) -> Procedure[None]:
-        if not (yield from self._go(self._model.home)):
+        if not (yield from go(self._ways, self._model.home)):
             # All is captured: where the arms rest takes nothing from the result.
-            yield from tell(NotHome(self._ways.blocked_by((yield from self._here()), self._model.home)))
+            yield from tell(NotHome(self._ways.blocked_by((yield from here()), self._model.home)))
 
 
 def requests_of(procedure: ProcedureConfig) -> list[Request]:
@@ -422,16 +426,19 @@ def _point_done(constraint: PlannedConstraint, position: int, point: PointRecord
 def _view_record(view: View | None) -> dict[str, Any] | None:
     if view is None:
         return None
-    return {"active_rad": view.active, "passive_rad": view.passive, "corners_px": _pixels(view.corners)}
+    return {"active_rad": view.active, "passive_rad": view.passive, "corners_px": corners_to_record(view.corners)}
 
 
 def _view_from(record: dict[str, Any] | None) -> View | None:
     if record is None:
         return None
-    corners = np.array([corner or (np.nan, np.nan) for corner in record["corners_px"]])
+    corners = corners_from_record(record["corners_px"])
     return View(tuple(record["active_rad"]), tuple(record["passive_rad"]), corners)
 
 
-def _pixels(corners: Array) -> tuple[tuple[float, float] | None, ...]:
-    """Corners (n, 2) px as they are recorded: None for one that was not seen."""
-    return tuple((float(u), float(v)) if np.isfinite(u) else None for u, v in corners)
+def _posture_record(posture: Posture | None) -> dict[str, Any] | None:
+    return None if posture is None else posture.to_record()
+
+
+def _posture_from(record: dict[str, Any] | None) -> Posture | None:
+    return None if record is None else Posture.from_record(record)

@@ -20,6 +20,7 @@ from procedures.steps import (
     KeepDocument,
     KeepImage,
     Look,
+    Mark,
     Move,
     Procedure,
     Read,
@@ -27,6 +28,7 @@ from procedures.steps import (
     Sighting,
     Task,
     Tell,
+    Work,
 )
 
 T = TypeVar("T")
@@ -41,6 +43,7 @@ class Engine:
 
     def __init__(self, cell: Cell, session: Session, observers: Observers) -> None:
         self._cell = cell
+        self._recording = cell.recording
         self._session = session
         self._observers = observers
         self._wake = threading.Event()
@@ -91,22 +94,42 @@ class Engine:
                 return self._look()
             case Task():
                 return self._task(step)
+            case Work():
+                return self._work(step)
+        return self._keep(step)
+
+    def _keep(self, step: object) -> None:
+        """Steps that ask nothing of the devices and have no reply."""
+        match step:
             case Tell(event):
-                return self._observers.tell(event)
+                self._recording.note(str(event))
+                self._observers.tell(event)
+            case Mark(time, feature):
+                self._recording.mark(time, feature)
             case KeepImage(name, image):
-                return self._session.write_image(name, image)
+                self._session.write_image(name, image)
             case KeepDocument(file_name, document):
-                return self._session.write_document(file_name, document)
-            case Believe(placement, geometry):
-                return self._cell.guard.place(placement, geometry)
-        raise TypeError(f"{step!r} is no step")
+                self._session.write_document(file_name, document)
+                self._recording.document(file_name, document)
+            case Believe(placement, geometry, T_H_E):
+                self._recording.belief(placement.T_P_A, T_H_E)
+                self._cell.guard.place(placement, geometry)
+            case _:
+                raise TypeError(f"{step!r} is no step")
 
     def _task(self, task: Task) -> Any:
         finished = self._session.journal.result(task.key)
         if finished is not None:
             return task.result.from_record(finished)
+        self._recording.step_begun(task.key)
         result = self._drive(task.body())
+        self._recording.step_finished(task.key)
         self._session.journal.append(task.key, result.to_record())
+        return result
+
+    def _work(self, work: Work) -> Any:
+        result = work.body()
+        self._recording.worked(work.what, work.asked, work.write(result))
         return result
 
     def _reading(self, arm: Arm) -> ArmReading:
@@ -150,6 +173,7 @@ class Engine:
                     "check what moves or shakes the arm, or what its encoders scatter by",
                 )
             joints.append(tuple(map(float, np.mean([first.positions, last.positions], axis=0))))
+        self._recording.stands(frame.time, {arm.robot.name: q for arm, q in zip(arms, joints, strict=True)})
         return Sighting(frame, *joints)
 
     def _raise_if_aborted(self) -> None:

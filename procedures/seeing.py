@@ -8,9 +8,10 @@ import numpy as np
 
 from dualcal_hal.errors import ArmMoved
 from procedures.detection import Detection, Detector, Miss, Missed
+from procedures.detection.outcome import found_from_record, found_to_record
 from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel
-from procedures.steps import Procedure, Sighting, look
+from procedures.steps import Mark, Procedure, Sighting, look, work
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +37,21 @@ def see(model: CellModel, detector: Detector, belief: Belief) -> Procedure[Seen]
     except ArmMoved as moved:
         return Seen(None, None, str(moved))
     predicted = model.predict_corners(sighting.active, sighting.passive, belief)
-    found = detector.detect(sighting.frame.image, predicted if np.all(np.isfinite(predicted)) else None)
+    near = predicted if np.all(np.isfinite(predicted)) else None
+    image = sighting.frame.image
+    found = yield from work(
+        "detection", {}, lambda: detector.detect(image, near), found_to_record, found_from_record, of_image=True
+    )
+    yield Mark(sighting.frame.time, _feature(found))
     if isinstance(found, Missed):
         return Seen(sighting, None, str(found))
     if not found.order_known:
         unknown = Missed(Miss.AMBIGUOUS_ORDER, "the pattern looks alike from two sides; use charuco")
         return Seen(sighting, found, str(unknown))
     return Seen(sighting, found)
+
+
+def _feature(found: Detection | Missed) -> tuple[float, float] | None:
+    if isinstance(found, Missed) or not np.all(np.isfinite(found.feature)):
+        return None
+    return float(found.feature[0]), float(found.feature[1])

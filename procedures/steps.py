@@ -13,6 +13,7 @@ from dualcal_hal.camera import Frame, Image
 from dualcal_hal.geometry import CellGeometry, Placement
 from dualcal_hal.robot import Joints, RobotState
 from dualcal_hal.session.journal import StepKey
+from dualcal_hal.transforms import Array
 
 T = TypeVar("T")
 Procedure = Generator[Any, Any, T]
@@ -77,10 +78,14 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Believe:
-    """From here on the guard judges clearance with the arms' bases placed so and their shapes these."""
+    """From here on the guard judges clearance with the arms' bases placed so and their shapes these.
+
+    T_H_E: (4, 4) the camera on its flange, for viewers.
+    """
 
     placement: Placement
     geometry: CellGeometry
+    T_H_E: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +123,30 @@ class Task:
     result: type[Record]
 
 
+@dataclass(frozen=True, eq=False)
+class Work:
+    """Something to work out that takes no device. It is recorded, and a replay answers it from the recording.
+
+    what, asked: what is to be worked out, and for what, as plain JSON; write, read: the result as plain JSON and back.
+    of_image: worked out from an image, so a replay that has the very same image works it out anew.
+    """
+
+    what: str
+    asked: Any
+    body: Callable[[], Any]
+    write: Callable[[Any], Any]
+    read: Callable[[Any], Any]
+    of_image: bool = False
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Show viewers where (px) the feature was seen in the frame exposed at ``time``, if it was."""
+
+    time: float
+    feature: tuple[float, float] | None
+
+
 def read() -> Procedure[Readings]:
     """What both arms report now."""
     reply: Readings = yield Read()
@@ -139,6 +168,20 @@ def look() -> Procedure[Sighting]:
 def tell(event: object) -> Procedure[None]:
     """Hand an event to the observers."""
     yield Tell(event)
+
+
+def work(
+    what: str,
+    asked: Any,
+    body: Callable[[], T],
+    write: Callable[[T], Any],
+    read: Callable[[Any], T],
+    *,
+    of_image: bool = False,
+) -> Procedure[T]:
+    """What ``body`` returns, or what it returned when the run was recorded that is replayed."""
+    reply: T = yield Work(what, asked, body, write, read, of_image)
+    return reply
 
 
 def task(key: StepKey, body: Callable[[], Procedure[R]], result: type[R]) -> Procedure[R]:

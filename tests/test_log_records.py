@@ -14,6 +14,7 @@ from dualcal_hal import errors
 from dualcal_hal.robot import JointPath, Mode, MotionState, RobotState, StopResult
 from dualcal_hal.session.journal import StepKey
 from dualcal_hal.session.log import (
+    Arrived,
     Call,
     FrameRef,
     MotionEnded,
@@ -47,8 +48,9 @@ RECORDS = [
     MotionEnded("left", 1, MotionState.FAILED, None, 1.0, ERROR),
     StepBegun(KEY, 1.1),
     StepFinished(StepKey("looks", "calibration/00", None, "look"), 1.2),
-    Worked(0, "way", None, 1.3),
-    Worked(1, "plan", {"poses": [[0.1, 1e-300]]}, 1.4),
+    Arrived("left", 8, STATE, 1.2),
+    Worked(0, "way", {"to": [0.1]}, None, 1.3),
+    Worked(1, "plan", None, {"poses": [[0.1, 1e-300]]}, 1.4),
     Note("warning", "line\nbreak", 1.5),
 ]
 
@@ -164,7 +166,7 @@ def test_a_value_of_unknown_kind_is_refused_in_both_directions():
 
 def test_work_that_json_cannot_hold_is_refused_when_it_is_recorded():
     with pytest.raises(ValueError, match="not JSON compliant"):
-        to_json(Worked(0, "plan", {"x": math.nan}, 0.0))
+        to_json(Worked(0, "plan", None, {"x": math.nan}, 0.0))
 
 
 @pytest.mark.parametrize("record", RECORDS, ids=lambda record: type(record).__name__)

@@ -126,7 +126,7 @@ STATE = RobotState((0.0,), (0.0,), Mode.READY, (), 0.0, 0)
     [
         ([Call("left", 0, "read", {}, 0.0)], "left: read 0 has no reply"),
         ([Reply("left", 0, None, 0.0)], "left: a reply 0 to no call"),
-        ([Worked(1, "plan", None, 0.0)], "work 1 where 0 is due"),
+        ([Worked(1, "plan", None, None, 0.0)], "work 1 where 0 is due"),
         ([MotionEnded("left", 3, MotionState.SETTLED, STATE, 0.0)], "left: a motion 3 ends that was not begun"),
         (
             [Call("camera", 0, "grab", {}, 0.0), Reply("camera", 0, FrameRef("camera", 5, 0.0), 0.0)],
@@ -231,7 +231,7 @@ def test_devices_determine_the_channels(arms):
     layout = Layout(tuple(arms), "camera")
     assert Layout.from_text(layout.to_text()) == layout
     assert Layout.of_topics([channel.topic for channel in layout.channels()]) == layout
-    assert [channel.number for channel in layout.channels()] == list(range(1, 13 + len(arms)))
+    assert [channel.number for channel in layout.channels()] == list(range(1, 14 + len(arms)))
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"arms": 3, "camera": "c"}', '{"arms": [1], "camera": "c"}'])

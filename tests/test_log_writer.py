@@ -227,7 +227,7 @@ def test_what_could_not_be_read_again_is_refused(path, image):
 def test_a_record_too_large_to_be_read_is_refused(path, monkeypatch):
     monkeypatch.setattr(writer, "LONGEST_RECORD", 1000)
     with open_log(path) as log, pytest.raises(ValueError, match=r"Worked of .* too large"):
-        log.record(Worked(0, "plan", "x" * 1000, 0.0))
+        log.record(Worked(0, "plan", None, "x" * 1000, 0.0))
 
 
 @pytest.mark.parametrize("time", [float("nan"), float("inf"), -1e30, 1e30])

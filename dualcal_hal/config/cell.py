@@ -14,6 +14,7 @@ from dualcal_hal.config.fixtures import FixtureConfig
 from dualcal_hal.config.nominal import NominalConfig
 from dualcal_hal.config.procedure import ProcedureConfig
 from dualcal_hal.config.robots import RobotConfig
+from dualcal_hal.config.session import SessionConfig
 from dualcal_hal.config.simulation import SimulationConfig
 from dualcal_hal.config.target import TargetConfig
 from dualcal_hal.config.values import Number, Section
@@ -39,6 +40,8 @@ class CellConfig(Section):
     """Height of the floor in each arm's base frame, mm; null for none."""
     fixtures: dict[str, FixtureConfig] = Field(default={})
     """What stands about the arms and must not be touched, by a name of your own."""
+    session: SessionConfig = SessionConfig()
+    """How a run is recorded."""
 
     @property
     def floor(self) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import uuid
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,12 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 def write_document(path: Path, document: dict[str, Any]) -> None:
     """Write a JSON document atomically; ValueError for NaN and infinities, which JSON does not have."""
-    write_atomically(path, json.dumps(document, indent=1, allow_nan=False).encode() + b"\n")
+    write_atomically(path, document_bytes(document))
+
+
+def document_bytes(document: Mapping[str, Any]) -> bytes:
+    """A JSON document as it is kept; ValueError for NaN and infinities."""
+    return json.dumps(document, indent=1, allow_nan=False).encode() + b"\n"
 
 
 def read_document(path: Path, expected_format: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,3 +70,39 @@ class Detection:
     def feature(self) -> Array:
         """(2,) px: the feature point, NaN if it was not seen."""
         return np.asarray(self.corners[self.feature_index])
+
+
+def found_to_record(found: Detection | Missed) -> dict[str, Any]:
+    """What came of looking for a target, as plain JSON."""
+    if isinstance(found, Missed):
+        return {"missed": str(found.reason), "detail": found.detail}
+    return {
+        "corners_px": corners_to_record(found.corners),
+        "order_known": found.order_known,
+        "blur_px": found.blur,
+        "contrast": found.contrast,
+        "feature_index": found.feature_index,
+    }
+
+
+def found_from_record(record: dict[str, Any]) -> Detection | Missed:
+    """And back, to the last bit."""
+    if "missed" in record:
+        return Missed(Miss(record["missed"]), record["detail"])
+    return Detection(
+        corners_from_record(record["corners_px"]),
+        record["order_known"],
+        record["blur_px"],
+        record["contrast"],
+        record["feature_index"],
+    )
+
+
+def corners_to_record(corners: Array) -> tuple[tuple[float, float] | None, ...]:
+    """Corners (n, 2) px as they are recorded: None for one that was not seen."""
+    return tuple((float(u), float(v)) if np.isfinite(u) else None for u, v in corners)
+
+
+def corners_from_record(record: Any) -> Array:
+    """And back: (n, 2) px, NaN for one that was not seen."""
+    return np.array([corner or (np.nan, np.nan) for corner in record], dtype=float)

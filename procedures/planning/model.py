@@ -5,7 +5,7 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -109,6 +109,15 @@ class Posture:
     @staticmethod
     def of(q_a: ArrayLike, q_p: ArrayLike) -> Posture:
         return Posture(tuple(map(float, np.asarray(q_a))), tuple(map(float, np.asarray(q_p))))
+
+    def to_record(self) -> dict[str, Any]:
+        """As plain JSON."""
+        return {"active_rad": self.active, "passive_rad": self.passive}
+
+    @classmethod
+    def from_record(cls, record: dict[str, Any]) -> Self:
+        """And back, to the last bit."""
+        return cls(tuple(record["active_rad"]), tuple(record["passive_rad"]))
 
 
 class CellModel:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +33,15 @@ class Leg:
     def goal(self) -> Joints:
         """Where it ends."""
         return self.waypoints[-1]
+
+    def to_record(self) -> dict[str, Any]:
+        """As plain JSON."""
+        return {"arm": self.arm, "waypoints_rad": self.waypoints}
+
+    @classmethod
+    def from_record(cls, record: dict[str, Any]) -> Self:
+        """And back, to the last bit."""
+        return cls(record["arm"], tuple(map(tuple, record["waypoints_rad"])))
 
 
 class WayFinder:

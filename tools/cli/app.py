@@ -37,6 +37,9 @@ def run(
         bool, typer.Option("--dry-run", help="Show stand-off, looks and a provisional plan only.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Move without asking, on a cell that is not simulated.")] = False,
+    log: Annotated[
+        bool, typer.Option("--log/--no-log", help="Record all that passes between program and devices.")
+    ] = True,
     json: Json = False,
 ) -> None:
     """Calibrate a cell: look, plan, align and capture, estimate, verify.
@@ -47,7 +50,7 @@ def run(
     with ended_in_order():
         from tools.cli.run import RunOptions, run_cell
 
-        code = run_cell(RunOptions(cell, out, seed, method, tuple(overrides or ()), dry_run, yes, json))
+        code = run_cell(RunOptions(cell, out, seed, method, tuple(overrides or ()), dry_run, yes, log, json))
     raise typer.Exit(code)
 
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from queue import SimpleQueue
 from types import FrameType
 
-from dualcal_hal.errors import DeviceError, DualcalError, Interrupted
+from dualcal_hal.errors import DeviceError, DualcalError, Interrupted, LogDamaged, LogNotWritten
 
 FAULT, USAGE, INTERRUPTED = 1, 2, 130
 
@@ -116,7 +116,7 @@ def ended_in_order() -> Iterator[None]:
         sys.stdout.flush()
     except _Break as error:
         _end(error, _received or "", INTERRUPTED)
-    except DeviceError as error:
+    except (DeviceError, LogDamaged, LogNotWritten) as error:
         _end(error, str(error), FAULT)
     except DualcalError as error:
         _end(error, str(error), USAGE)

@@ -19,6 +19,8 @@ from dualcal_hal.errors import UsageError
 from dualcal_hal.session.captures import Captures, write_captures
 from dualcal_hal.session.distances import read_distances
 from dualcal_hal.session.folder import Session
+from dualcal_hal.session.log import next_segment
+from dualcal_hal.session.log.recording import LogRecording, Recording
 from dualcal_hal.session.result import Result, with_truth_error, write_result
 from procedures.alignment import largest_alignment_error, tolerance_px
 from procedures.analysis import analyse
@@ -46,6 +48,7 @@ class RunOptions:
     overrides: tuple[str, ...]
     dry_run: bool
     yes: bool
+    log: bool
     json: bool
 
 
@@ -65,6 +68,26 @@ def run_cell(options: RunOptions) -> int:
     _confirm(cell, options.yes)
     started = utc_now()
     session = Session.create(options.out or _unused_folder(started, file.cell.name), file.text)
+    with _recording(options, session, file, cell) as recording:
+        cell.record(recording)
+        captures = _run(console, file, cell, calibration, session, started)
+        result = conclude(file, session, captures)
+        recording.document(session.result_path.name, result.to_document())
+    show_result(console, file.cell, result, simulated_truth(file), as_json=options.json)
+    if (distances := read_distances(session)) is not None:
+        console.print(f"least distance between the arms {distances.least()}", highlight=False)
+    console.print(f"session: {session.folder}", soft_wrap=True, highlight=False)
+    return 0 if result.verdict == "ok" else FAULT
+
+
+def _recording(options: RunOptions, session: Session, file: CellFile, cell: Cell) -> Recording:
+    return LogRecording(next_segment(session.folder), file, cell.clock) if options.log else Recording()
+
+
+def _run(
+    console: Console, file: CellFile, cell: Cell, calibration: Calibration, session: Session, started: datetime
+) -> Captures:
+    """The run itself; its captures are written however it ends."""
     with signals_deferred() as signals:
         try:
             with progress(console) as watcher:
@@ -75,13 +98,7 @@ def run_cell(options: RunOptions) -> int:
             except OSError as second:
                 error.add_note(f"captures.json could not be written ({second.strerror}); the journal has them")
             raise
-        captures = _write_captures(file, session, started)
-    result = conclude(file, session, captures)
-    show_result(console, file.cell, result, simulated_truth(file), as_json=options.json)
-    if (distances := read_distances(session)) is not None:
-        console.print(f"least distance between the arms {distances.least()}", highlight=False)
-    console.print(f"session: {session.folder}", soft_wrap=True, highlight=False)
-    return 0 if result.verdict == "ok" else FAULT
+        return _write_captures(file, session, started)
 
 
 def _rehearse(console: Console, file: CellFile, model: CellModel, options: RunOptions) -> None:

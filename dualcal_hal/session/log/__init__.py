@@ -17,6 +17,7 @@ from dualcal_hal.session.log.reader import (
     segment_paths,
 )
 from dualcal_hal.session.log.records import (
+    Arrived,
     Call,
     FrameRef,
     MotionEnded,
@@ -32,6 +33,7 @@ from dualcal_hal.session.log.records import (
 from dualcal_hal.session.log.writer import LogWriter
 
 __all__ = [
+    "Arrived",
     "Attached",
     "Call",
     "Ending",

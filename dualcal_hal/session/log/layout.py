@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dualcal_hal.session.log.records import (
+    Arrived,
     Call,
     MotionEnded,
     Note,
@@ -33,6 +34,7 @@ RECORD_TOPICS: dict[type[Record], str] = {
     Call: "/dualcal/calls",
     Reply: "/dualcal/replies",
     MotionEnded: "/dualcal/motions",
+    Arrived: "/dualcal/arrivals",
     StepBegun: "/dualcal/steps/begun",
     StepFinished: "/dualcal/steps/finished",
     Worked: "/dualcal/work",

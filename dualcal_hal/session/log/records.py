@@ -108,11 +108,25 @@ class StepFinished:
 
 
 @dataclass(frozen=True)
+class Arrived:
+    """A state arrived at whoever subscribed by the call of that index."""
+
+    device: str
+    index: int
+    state: RobotState
+    time: float
+
+
+@dataclass(frozen=True)
 class Worked:
-    """Something was worked out without a device. ``index`` counts them from 0; ``result`` is plain JSON."""
+    """Something was worked out without a device. ``index`` counts them from 0.
+
+    asked: what for; result: what came of it. Both are plain JSON.
+    """
 
     index: int
     what: str
+    asked: Any
     result: Any
     time: float
 
@@ -126,7 +140,7 @@ class Note:
     time: float
 
 
-Record = Call | Reply | MotionEnded | StepBegun | StepFinished | Worked | Note
+Record = Call | Reply | MotionEnded | Arrived | StepBegun | StepFinished | Worked | Note
 
 
 def to_json(record: Record) -> bytes:
@@ -462,7 +476,7 @@ class _Form:
     schema: Mapping[str, Any]
 
 
-def _of_device(record: Call | Reply | MotionEnded) -> dict[str, Any]:
+def _of_device(record: Call | Reply | MotionEnded | Arrived) -> dict[str, Any]:
     return {"device": record.device, "index": record.index}
 
 
@@ -536,12 +550,23 @@ _FORMS: dict[type[Any], _Form] = {
             "time_s": _NUMBER,
         },
     ),
+    Arrived: _Form(
+        lambda r: {**_of_device(r), "state": _state(r.state), "time_s": _number(r.time)},
+        lambda f: Arrived(f.text("device"), f.whole("index"), _read_state(f.part("state")), f.number("time_s")),
+        {"device": _TEXT, "index": _WHOLE, "state": _STATE, "time_s": _NUMBER},
+    ),
     StepBegun: _step_form(StepBegun),
     StepFinished: _step_form(StepFinished),
     Worked: _Form(
-        lambda r: {"index": r.index, "what": r.what, "result": r.result, "time_s": _number(r.time)},
-        lambda f: Worked(f.whole("index"), f.text("what"), f.any("result"), f.number("time_s")),
-        {"index": _WHOLE, "what": _TEXT, "result": {}, "time_s": _NUMBER},
+        lambda r: {
+            "index": r.index,
+            "what": r.what,
+            "asked": r.asked,
+            "result": r.result,
+            "time_s": _number(r.time),
+        },
+        lambda f: Worked(f.whole("index"), f.text("what"), f.any("asked"), f.any("result"), f.number("time_s")),
+        {"index": _WHOLE, "what": _TEXT, "asked": {}, "result": {}, "time_s": _NUMBER},
     ),
     Note: _Form(
         lambda r: {"level": r.level, "text": r.text, "time_s": _number(r.time)},

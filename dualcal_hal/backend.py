@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from dualcal_hal.camera import Camera
@@ -14,6 +15,18 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from dualcal_hal.cellfile import CellFile
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came of a piece of work in a recorded run.
+
+    result: gives it as plain JSON, or raises the error that it ended in; images_are_exact: whether the images that
+    are played back are the very same, so that what was worked out from them can be worked out anew.
+    """
+
+    result: Callable[[], Any]
+    images_are_exact: bool
 
 
 class Backend(ABC):
@@ -52,6 +65,14 @@ class Backend(ABC):
     @abstractmethod
     def camera(self, name: str) -> Camera:
         """The camera of that name; UnknownDevice if it has none."""
+
+    def answer(self, what: str, asked: Any) -> Answer | None:
+        """What came of that piece of work in the run that is played back; None where none is.
+
+        what, asked: as the work was recorded, plain JSON. Raises ReplayMismatch if the recorded run worked out
+        something else there, and LogEnded.
+        """
+        return None
 
     def documents(self) -> Mapping[str, dict[str, Any]]:
         """JSON documents that are to be kept beside the run, by file name; asked for while it is open."""

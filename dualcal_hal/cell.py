@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
-from dualcal_hal.backend import Backend
+from dualcal_hal.backend import Answer, Backend
 from dualcal_hal.camera import Camera
 from dualcal_hal.cellfile import CellFile
 from dualcal_hal.clock import Clock, RealClock
@@ -82,6 +82,11 @@ class Cell:
     def arm(self, name: str) -> Arm:
         """The arm of that name in the cell file."""
         return {self.active.robot.name: self.active, self.passive.robot.name: self.passive}[name]
+
+    def answer(self, what: str, asked: Any) -> Answer | None:
+        """What a replay has for a piece of work, see :meth:`Backend.answer`; None where it is to be done."""
+        answers = (backend.answer(what, asked) for backend in self._backends.values())
+        return next((answer for answer in answers if answer is not None), None)
 
     def documents(self) -> dict[str, dict[str, Any]]:
         """What the backends want kept beside the run, by file name; asked for while the cell is open."""

@@ -70,8 +70,8 @@ class VirtualClock(Clock):
     so everything that happens in virtual time is deterministic.
     """
 
-    def __init__(self) -> None:
-        self._now = 0.0
+    def __init__(self, start: float = 0.0) -> None:
+        self._now = start
         self._calls: list[tuple[float, int, Handle, Callable[[], None]]] = []
         self._order = itertools.count()
         self._lock = threading.Lock()

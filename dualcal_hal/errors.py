@@ -21,7 +21,10 @@
         ├── MotionFailed (RuntimeError)
         │   └── Contact                     parts touch that should not
         ├── ArmMoved (RuntimeError)
-        └── StopFailed (RuntimeError)
+        ├── StopFailed (RuntimeError)
+        ├── ReplayMismatch (ValueError)     a command that is not the recorded one
+        ├── FrameMissing (LookupError)      an image that the recording should have
+        └── LogEnded (EOFError)             a command after the end of the recording
 
 Leaves also inherit the fitting builtin. No third party's exception crosses a backend's border.
 """
@@ -30,6 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 
 class DualcalError(Exception):
@@ -148,3 +152,37 @@ class ArmMoved(DeviceError, RuntimeError):
 
 class StopFailed(DeviceError, RuntimeError):
     """An arm was told to stop and did not confirm that it stands."""
+
+
+class ReplayMismatch(DeviceError, ValueError):
+    """What is asked is not what was asked in the recorded run, at this place."""
+
+    index: int | None = None
+    """Of the device's calls, or of the pieces of work; None in an error that comes from a recording itself."""
+    expected: object = None
+    got: object = None
+
+    @classmethod
+    def at(cls, device: str, index: int, expected: object, got: object, what: str) -> Self:
+        """``what`` differs, in a few words; ``expected`` was recorded."""
+        where = f"the recorded run differs at its {index + 1}. call" if device != WORK else f"at its {index + 1}. work"
+        mismatch = cls(
+            device,
+            "replay",
+            f"{where}: {what}; recorded: {expected}; now: {got}",
+            "the procedure, its settings or the cell file are not those of the recorded run",
+        )
+        mismatch.index, mismatch.expected, mismatch.got = index, expected, got
+        return mismatch
+
+
+class FrameMissing(DeviceError, LookupError):
+    """The recording has a reply of the camera, but not the image that it speaks of."""
+
+
+class LogEnded(DeviceError, EOFError):
+    """The recording has nothing more for this device."""
+
+
+WORK = "procedure"
+"""Stands for a device where something is worked out without one."""

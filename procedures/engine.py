@@ -128,7 +128,14 @@ class Engine:
         return result
 
     def _work(self, work: Work) -> Any:
-        result = work.body()
+        answer = self._cell.answer(work.what, work.asked)
+        if answer is not None and not (work.of_image and answer.images_are_exact):
+            return work.read(answer.result())
+        try:
+            result = work.body()
+        except DualcalError as error:
+            self._recording.worked(work.what, work.asked, None, error)
+            raise
         self._recording.worked(work.what, work.asked, work.write(result))
         return result
 

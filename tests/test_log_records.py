@@ -51,6 +51,7 @@ RECORDS = [
     Arrived("left", 8, STATE, 1.2),
     Worked(0, "way", {"to": [0.1]}, None, 1.3),
     Worked(1, "plan", None, {"poses": [[0.1, 1e-300]]}, 1.4),
+    Worked(2, "plan", None, None, 1.4, ERROR),
     Note("warning", "line\nbreak", 1.5),
 ]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, PrivateAttr, ValidationInfo, field_validator, model_validator
 
 from dualcal_hal import registry
 
@@ -24,14 +24,21 @@ class BackendEntry(BaseModel):
             raise ValueError(f"unknown backend '{value}'; there are: {', '.join(registry.backend_names())}")
         return value
 
+    _checked: BaseModel = PrivateAttr()
+
     @model_validator(mode="after")
-    def _options_fit(self) -> Self:
+    def _options_fit(self, info: ValidationInfo) -> Self:
         try:
             backend = registry.backend_class(self.type)
         except ImportError as error:
             raise ValueError(f"backend '{self.type}' cannot be imported: {error}") from error
-        backend.Options.model_validate(self.options)
+        self._checked = backend.Options.model_validate(self.options, context=info.context)
         return self
+
+    @property
+    def checked(self) -> BaseModel:
+        """The options as the model of the backend's type."""
+        return self._checked
 
     @property
     def options(self) -> dict[str, Any]:

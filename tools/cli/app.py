@@ -74,6 +74,24 @@ def estimate(
 
 
 @app.command()
+def replay(
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.", show_default=False)],
+    out: Annotated[Path | None, typer.Option(help="A new folder to keep what the replay gives.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print a JSON document alone on standard output.")] = False,
+) -> None:
+    """Run the procedure again on what was recorded, without any device, and compare the results.
+
+    Exit code 0 if the replay came to the same, 1 if not or if the log is damaged, 2 for a call or session that cannot
+    be used, 130 when interrupted.
+    """
+    with ended_in_order():
+        from tools.cli.replay import ReplayOptions, replay_session
+
+        code = replay_session(ReplayOptions(session, out, json))
+    raise typer.Exit(code)
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON Schema of a cell file."""
     with ended_in_order():

@@ -94,11 +94,11 @@ def _run(
                 execute(cell, calibration, session, watcher, lambda engine: signals.pass_on_to(engine.abort))
         except BaseException as error:
             try:
-                _write_captures(file, session, started)
+                write_session_captures(file, session, started)
             except OSError as second:
                 error.add_note(f"captures.json could not be written ({second.strerror}); the journal has them")
             raise
-        return _write_captures(file, session, started)
+        return write_session_captures(file, session, started)
 
 
 def _rehearse(console: Console, file: CellFile, model: CellModel, options: RunOptions) -> None:
@@ -132,8 +132,10 @@ def _unused_folder(started: datetime, name: str) -> Path:
     return folder if not folder.exists() else next(other for other in numbered if not other.exists())
 
 
-def _write_captures(file: CellFile, session: Session, started: datetime) -> Captures:
-    captures = captures_of(session.journal, file.sha256, started.isoformat(timespec="seconds"))
+def write_session_captures(file: CellFile, session: Session, started: datetime | None) -> Captures:
+    """``captures.json`` from the journal."""
+    begun = None if started is None else started.isoformat(timespec="seconds")
+    captures = captures_of(session.journal, file.sha256, begun)
     write_captures(session.captures_path, captures)
     return captures
 

@@ -15,7 +15,7 @@ from typing import Any, Self, TypeVar
 from dualcal_hal.camera import Camera, Frame
 from dualcal_hal.cellfile import CellFile
 from dualcal_hal.clock import Clock, utc_now
-from dualcal_hal.errors import LogNotWritten
+from dualcal_hal.errors import DualcalError, LogNotWritten
 from dualcal_hal.robot import JointPath, Joints, Motion, Robot, RobotState, StopResult
 from dualcal_hal.session.files import document_bytes
 from dualcal_hal.session.journal import StepKey
@@ -68,8 +68,8 @@ class Recording:
     def step_finished(self, key: StepKey) -> None:
         """A step has a result; all that was recorded of it is on the disk when this returns."""
 
-    def worked(self, what: str, asked: Any, result: Any) -> None:
-        """Something was worked out without a device; plain JSON."""
+    def worked(self, what: str, asked: Any, result: Any, error: DualcalError | None = None) -> None:
+        """Something was worked out without a device, or ended in an error; ``asked`` and ``result`` are plain JSON."""
 
     def note(self, text: str, level: Level = "info") -> None:
         """A line for a person."""
@@ -160,8 +160,9 @@ class LogRecording(Recording):
         self.record(StepFinished(key, self.now()))
         self._log.sync()
 
-    def worked(self, what: str, asked: Any, result: Any) -> None:
-        self.record(Worked(self._worked, what, asked, result, self.now()))
+    def worked(self, what: str, asked: Any, result: Any, error: DualcalError | None = None) -> None:
+        failure = None if error is None else RecordedError.of(error)
+        self.record(Worked(self._worked, what, asked, result, self.now(), failure))
         self._worked += 1
 
     def note(self, text: str, level: Level = "info") -> None:

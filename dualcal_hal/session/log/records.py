@@ -121,7 +121,7 @@ class Arrived:
 class Worked:
     """Something was worked out without a device. ``index`` counts them from 0.
 
-    asked: what for; result: what came of it. Both are plain JSON.
+    asked: what for; result: what came of it, None for an error. Both are plain JSON.
     """
 
     index: int
@@ -129,6 +129,7 @@ class Worked:
     asked: Any
     result: Any
     time: float
+    error: RecordedError | None = None
 
 
 @dataclass(frozen=True)
@@ -563,10 +564,18 @@ _FORMS: dict[type[Any], _Form] = {
             "what": r.what,
             "asked": r.asked,
             "result": r.result,
+            "error": _error(r.error),
             "time_s": _number(r.time),
         },
-        lambda f: Worked(f.whole("index"), f.text("what"), f.any("asked"), f.any("result"), f.number("time_s")),
-        {"index": _WHOLE, "what": _TEXT, "asked": {}, "result": {}, "time_s": _NUMBER},
+        lambda f: Worked(
+            f.whole("index"),
+            f.text("what"),
+            f.any("asked"),
+            f.any("result"),
+            f.number("time_s"),
+            _read_error(f.part_or_none("error")),
+        ),
+        {"index": _WHOLE, "what": _TEXT, "asked": {}, "result": {}, "error": _ERROR, "time_s": _NUMBER},
     ),
     Note: _Form(
         lambda r: {"level": r.level, "text": r.text, "time_s": _number(r.time)},

@@ -1,0 +1,158 @@
+"""``dualcal replay``."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+import typer
+from rich.console import Console
+
+from dualcal_hal.cell import Cell
+from dualcal_hal.cellfile import CellFile, load_cell
+from dualcal_hal.errors import DualcalError, FrameMissing, Interrupted, LogDamaged, ReplayMismatch, UsageError
+from dualcal_hal.session.comparison import Comparison, compare_captures, compare_results
+from dualcal_hal.session.folder import Session
+from dualcal_hal.session.journal import Journal
+from dualcal_hal.session.log import segment_paths
+from dualcal_hal.session.result import Result, read_result
+from procedures.calibrate import Calibration, captures_of
+from procedures.planning.model import CellModel
+from tools.cli.exits import FAULT, signals_deferred
+from tools.cli.run import conclude, execute, write_session_captures
+
+_NO_END_OF_A_RUN = (ReplayMismatch, FrameMissing, LogDamaged, Interrupted)
+"""Errors that say that the replay failed, and not that the recorded run ended so."""
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """What the command line says."""
+
+    session: Path
+    out: Path | None
+    json: bool
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """result: None if the recorded run has none; ended: how that run ended then; times in s."""
+
+    result: Result | None
+    ended: str
+    recorded_time: float
+    time: float
+    captures: Comparison
+    results: Comparison | None
+
+    @property
+    def identical(self) -> bool:
+        return self.captures.identical and (self.results is None or self.results.identical)
+
+    @property
+    def differences(self) -> tuple[str, ...]:
+        return (*self.captures.differences, *(self.results.differences if self.results else ()))
+
+
+def replay_session(options: ReplayOptions) -> int:
+    """Play a session back and compare; 0 if it came to the same."""
+    file = _load(options.session)
+    console = Console(stderr=options.json)
+    with _folder(options.out) as folder:
+        replayed = _replay(options.session, file, Session.create(folder, file.text))
+    if options.json:
+        typer.echo(json.dumps(_document(replayed), indent=1, allow_nan=False))
+    else:
+        _show(console, replayed)
+    return FAULT if replayed.differences else 0
+
+
+def _load(session: Path) -> CellFile:
+    """The session's cell with all its devices played back from its log."""
+    path = session / "cell.yaml"
+    if not path.is_file():
+        raise UsageError(f"{session}: is no session: there is no cell.yaml in it")
+    segment_paths(session)  # refused now, before anything is begun
+    cell = load_cell(path).cell
+    name = "replay"
+    while name in cell.backends:
+        name += "_"
+    entry = json.dumps({"type": "replay", "session": str(session.absolute())})
+    devices = [*(f"robots.{arm}" for arm in cell.robots), "camera"]
+    return load_cell(path, [f"backends.{name}={entry}", *(f"{device}.backend={name}" for device in devices)])
+
+
+@contextmanager
+def _folder(out: Path | None) -> Iterator[Path]:
+    if out is not None:
+        yield out
+        return
+    with tempfile.TemporaryDirectory(prefix="dualcal-replay-") as folder:
+        yield Path(folder) / "session"
+
+
+def _replay(recorded: Path, file: CellFile, session: Session) -> Replayed:
+    expected = read_result(recorded / "result.json") if (recorded / "result.json").exists() else None
+    cell, calibration = Cell(file), Calibration(file.cell, CellModel(file.cell))
+    begun = perf_counter()
+    result, ended = None, ""
+    try:
+        with signals_deferred() as signals:
+            execute(cell, calibration, session, lambda event: None, lambda engine: signals.pass_on_to(engine.abort))
+        captures = write_session_captures(file, session, None)
+        result = conclude(file, session, captures)
+    except _NO_END_OF_A_RUN:
+        raise
+    except DualcalError as error:
+        if expected is not None:
+            raise
+        ended = str(error)
+    taken = captures_of(session.journal, file.sha256, None).captures
+    there = captures_of(Journal(recorded / "journal.jsonl"), file.sha256, None).captures
+    return Replayed(
+        result,
+        ended,
+        cell.clock.now(),
+        perf_counter() - begun,
+        compare_captures(there, taken),
+        None if expected is None or result is None else compare_results(expected, result),
+    )
+
+
+def _document(replayed: Replayed) -> dict[str, object]:
+    return {
+        "identical": replayed.identical,
+        "differences": list(replayed.differences),
+        "recorded_run_ended": replayed.ended or None,
+        "recorded_s": replayed.recorded_time,
+        "replay_s": replayed.time,
+        "result": None if replayed.result is None else replayed.result.to_document(),
+    }
+
+
+def _show(console: Console, replayed: Replayed) -> None:
+    def say(text: str) -> None:
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    faster = replayed.recorded_time / replayed.time
+    say(f"{replayed.recorded_time:.0f} s of recorded time in {replayed.time:.1f} s, {faster:.0f} times as fast")
+    if replayed.results is None:
+        say(f"The recorded run has no result. It ended so: {replayed.ended or 'before it was analysed'}")
+    what = "captures" if replayed.results is None else "result"
+    if replayed.identical:
+        say(
+            f"The {what} is the same to the last bit."
+            if replayed.results
+            else "Its captures are the same to the last bit."
+        )
+    elif not replayed.differences:
+        say(f"The same {what}, within 1e-6 mm and 1e-9 rad.")
+    else:
+        say("The replay came to something else than the recorded run:")
+        for line in replayed.differences:
+            say(f"  {line}")

@@ -24,7 +24,7 @@ from dualcal_hal.session.result import Result, read_result
 from procedures.calibrate import Calibration, captures_of
 from procedures.planning.model import CellModel
 from tools.cli.exits import FAULT, signals_deferred
-from tools.cli.run import conclude, execute, write_session_captures
+from tools.cli.run import analyse_session, execute, write_session_captures
 
 _NO_END_OF_A_RUN = (ReplayMismatch, FrameMissing, LogDamaged, Interrupted)
 """Errors that say that the replay failed, and not that the recorded run ended so."""
@@ -105,7 +105,9 @@ def _replay(recorded: Path, file: CellFile, session: Session) -> Replayed:
         with signals_deferred() as signals:
             execute(cell, calibration, session, lambda event: None, lambda engine: signals.pass_on_to(engine.abort))
         captures = write_session_captures(file, session, None)
-        result = conclude(file, session, captures)
+        analyse_session(file, session, captures)
+        # Read as the recorded one is: what is compared is what the files say.
+        result = read_result(session.result_path)
     except _NO_END_OF_A_RUN:
         raise
     except DualcalError as error:

@@ -182,11 +182,7 @@ def _write_documents(cell: Cell, session: Session) -> None:
 
 def conclude(file: CellFile, session: Session, captures: Captures) -> Result:
     """Analyse, and only then compare with the truth where there is one; write both and the picture."""
-    result = analyse(captures, file.cell, file.cell.procedure.method)
-    truth = simulated_truth(file)
-    if truth is not None:
-        result = with_truth_error(result, truth)
-    write_result(session.result_path, result)
+    result = analyse_session(file, session, captures)
     shown = captures.captures[0]
     draw_summary(
         session.summary_path,
@@ -197,6 +193,16 @@ def conclude(file: CellFile, session: Session, captures: Captures) -> Result:
         image=session.read_image(shown.id),
         feature_px=shown.feature,
     )
+    return result
+
+
+def analyse_session(file: CellFile, session: Session, captures: Captures) -> Result:
+    """The result, with its error where there is a truth, written to the session."""
+    result = analyse(captures, file.cell, file.cell.procedure.method)
+    truth = simulated_truth(file)
+    if truth is not None:
+        result = with_truth_error(result, truth)
+    write_result(session.result_path, result)
     return result
 
 

@@ -7,8 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dualcal_hal.session.journal import StepKey
+from dualcal_hal.session.log.layout import RECORD_TOPICS, arm_of
 from dualcal_hal.session.log.reader import Item, LogReader
 from dualcal_hal.session.log.records import StepBegun, StepFinished
+
+_STEPS = {RECORD_TOPICS[StepBegun], RECORD_TOPICS[StepFinished]}
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,8 @@ class FinishedAttempts:
     """What happened in the files of a session's log, in order.
 
     Of a step's attempts the last finished one is kept, and in the last file also what no step finished: there the run
-    ended. What happened outside of steps counts in the last file alone.
+    ended. What happened outside of steps counts in the last file alone. Joint states, which are for viewers, are left
+    out.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -33,7 +37,7 @@ class FinishedAttempts:
         for number, path in enumerate(paths):
             steps = _Steps(number)
             with LogReader(path) as reader:
-                for item in reader.items():
+                for item in reader.items(_STEPS.__contains__):
                     finished = steps.follow(item)
                     if finished is not None:
                         self._finished[finished[0]] = finished[1]
@@ -44,7 +48,7 @@ class FinishedAttempts:
             is_last = number == len(self._paths) - 1
             steps = _Steps(number)
             with LogReader(path) as reader:
-                for item in reader.items():
+                for item in reader.items(lambda topic: arm_of(topic) is None):
                     current = steps.current
                     finished = steps.follow(item)
                     step = finished or steps.current or current

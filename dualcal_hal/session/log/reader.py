@@ -7,7 +7,7 @@ Whatever is wrong is LogMissing, LogDamaged or LogTooNew.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -139,11 +139,10 @@ class LogReader:
         """Any number of times."""
         self._file.close()
 
-    def items(self) -> Iterator[Item]:
-        """Records, images and joint states in the order in which they were written."""
+    def items(self, wanted: Callable[[str], bool] = lambda topic: True) -> Iterator[Item]:
+        """Records, images and joint states in the order in which they were written; those of the wanted topics."""
         for topic, message in self.messages():
-            item = self.item(topic, message)
-            if item is not None:
+            if wanted(topic) and (item := self.item(topic, message)) is not None:
                 yield item
 
     def item(self, topic: str, message: Message) -> Item | None:

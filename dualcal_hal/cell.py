@@ -104,7 +104,9 @@ class Cell:
 
     def _arm(self, name: str, config: RobotConfig) -> Arm:
         limits = JointLimits(config.lower, config.upper, config.speed, config.acceleration)
-        robot = GuardedRobot(self._recording.robot(self._backends[config.backend].robot(name)), limits, self.clock)
+        device = self._backends[config.backend].robot(name)
+        self._recording.watch(device)
+        robot = GuardedRobot(self._recording.robot(device), limits, self.clock)
         return Arm(robot, config.chain, limits, tuple(map(float, config.home)), config.encoder_sigma)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from dualcal_hal.cellfile import CellFile, load_cell
 
 PAPER = Path(__file__).parent.parent / "cells" / "paper.yaml"
+TINY = PAPER.with_name("tiny.yaml")
 KINEMATIC = "simulation.stepper=kinematic"
 """Without physics, where a test is about something else: it takes a third of the time."""
 FOUND_STAND_OFF = "procedure.stand_off=null"

@@ -1,4 +1,4 @@
-"""What holds for every test: it leaves no thread and no socket behind."""
+"""What holds for every test: it leaves no thread and no socket behind. And what many look at: a recorded run."""
 
 from __future__ import annotations
 
@@ -26,6 +26,18 @@ def _nothing_left_behind() -> Iterator[None]:
     left = [thread.name for thread in started if thread.is_alive()]
     assert not left, f"threads left behind: {left}"
     assert not _sockets() - sockets, "sockets left behind"
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The session of a finished run of the tiny cell; not to be changed."""
+    from tests.cells import TINY
+    from tests.command_line import dualcal
+
+    folder = tmp_path_factory.mktemp("recorded") / "session"
+    result = dualcal("run", TINY, "--out", folder)
+    assert result.exit_code == 0, result.output
+    return folder
 
 
 def _sockets() -> set[str]:

@@ -38,7 +38,11 @@ class ReplayedRobot(Robot):
         return _expect(reply, RobotState)
 
     def subscribe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
+        """What arrived by the recorded subscription; nothing where none was recorded, which is no command."""
         timeline = self._opened(self.name, "subscribe")
+        recorded = timeline.next_call(self.name)
+        if recorded is None or recorded.call.method != "subscribe":
+            return lambda: None
         call, _ = _answer(timeline, self.name, "subscribe")
         return timeline.subscribe(self.name, call.index, function)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -21,8 +21,8 @@ class Session:
         self.folder = folder
         self.journal = Journal(folder / "journal.jsonl")
 
-    @staticmethod
-    def create(folder: Path, cell_text: str) -> Session:
+    @classmethod
+    def create(cls, folder: Path, cell_text: str) -> Self:
         """A new session in an empty or not yet existing folder, else UsageError."""
         try:
             if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -31,7 +31,7 @@ class Session:
             write_atomically(folder / "cell.yaml", cell_text.encode())
         except OSError as error:
             raise UsageError(f"{folder}: cannot be written: {error.strerror}") from error
-        return Session(folder)
+        return cls(folder)
 
     @property
     def captures_path(self) -> Path:

@@ -6,18 +6,22 @@ A backend joins by one function here that makes a rig, and its entry in ``RIGS``
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 
+from backends.replay import ReplayBackend
 from backends.simulator import SimulatorBackend
 from dualcal_hal.backend import Backend
 from dualcal_hal.camera import Camera
 from dualcal_hal.cellfile import CellFile, load_cell
+from dualcal_hal.clock import Clock
 from dualcal_hal.config import RobotConfig
 from dualcal_hal.robot import JointPath, Joints, Robot
+from dualcal_hal.session.log import segment_name
+from dualcal_hal.session.log.recording import LogRecording, Recording
 
 PAPER_CELL = Path(__file__).parents[2] / "cells" / "paper.yaml"
 
@@ -81,3 +85,59 @@ RIGS: dict[str, Callable[[], Rig]] = {
     "simulator, kinematic": partial(_simulator, "kinematic", 0.0),
     "simulator, bullet": partial(_simulator, "bullet", 2e-5),
 }
+
+
+# The replay plays back a recording of the very clause that it is held against.
+
+
+class RecordedBackend(Backend):
+    """Another backend, with all that passes its border recorded."""
+
+    time = "drives"
+    simulated = True
+    Options = SimulatorBackend.Options
+
+    def __init__(self, backend: Backend, recording: Recording) -> None:
+        super().__init__(backend.name, backend.cell)
+        self._backend, self._recording = backend, recording
+        self._robots = {name: recording.robot(backend.robot(name)) for name in backend.cell.cell.robots}
+        self._camera = recording.camera(backend.camera("camera"))
+
+    @property
+    def clock(self) -> Clock:
+        return self._backend.clock
+
+    def open(self, timeout: float) -> None:
+        self._backend.open(timeout)
+
+    def close(self) -> None:
+        self._backend.close()
+
+    def robot(self, name: str) -> Robot:
+        self._backend.robot(name)
+        return self._robots[name]
+
+    def camera(self, name: str) -> Camera:
+        self._backend.camera(name)
+        return self._camera
+
+
+def recorded(session: Path) -> tuple[Rig, LogRecording]:
+    """The kinematic simulator, recorded into the session's log until that is left."""
+    rig = RIGS["simulator, kinematic"]()
+    recording = LogRecording(session / segment_name(1), rig.backend.cell, rig.backend.clock)
+    return replace(rig, backend=RecordedBackend(rig.backend, recording)), recording
+
+
+def replayed(session: Path) -> Rig:
+    """What was recorded there."""
+    rig = RIGS["simulator, kinematic"]()
+    return replace(rig, backend=_replay(session), broken=_replay(session / "nothing"))
+
+
+def _replay(session: Path) -> ReplayBackend:
+    entry = f"backends.log={{type: replay, session: {session}}}"
+    return ReplayBackend("log", _paper_cell(entry, *(f"{device}.backend=log" for device in _DEVICES)))
+
+
+_DEVICES = ("robots.left", "robots.right", "camera")

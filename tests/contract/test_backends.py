@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 import threading
 from collections.abc import Callable, Iterator
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,12 +22,16 @@ from dualcal_hal.errors import (
     UnknownDevice,
 )
 from dualcal_hal.robot import Mode, MotionState, RobotState
-from tests.contract.rigs import RIGS, Rig
+from tests.contract.rigs import RIGS, Rig, recorded, replayed
 
 
-@pytest.fixture(params=RIGS)
-def closed_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    rig = RIGS[request.param]()
+@pytest.fixture(params=[*RIGS, "replay"])
+def closed_rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
+    if request.param == "replay":
+        record(request, tmp_path)
+        rig = replayed(tmp_path)
+    else:
+        rig = RIGS[request.param]()
     yield rig
     rig.backend.close()
     rig.broken.close()
@@ -35,6 +41,21 @@ def closed_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
 def rig(closed_rig: Rig) -> Rig:
     closed_rig.backend.open(closed_rig.timeout)
     return closed_rig
+
+
+def record(request: pytest.FixtureRequest, session: Path) -> None:
+    """Run the clause itself on the simulator, and record that."""
+    rig, recording = recorded(session)
+    with recording:
+        names = inspect.signature(request.function).parameters
+        given = {**request.node.callspec.params, "closed_rig": rig, "rig": rig}
+        if "rig" in names:
+            rig.backend.open(rig.timeout)
+        try:
+            request.function(**{name: given[name] for name in names})
+        finally:
+            rig.backend.close()
+            rig.broken.close()
 
 
 def use_of_every_device(rig: Rig) -> list[Callable[[], object]]:

@@ -61,6 +61,9 @@ def estimate(
     method: Method = None,
     truth: Annotated[Path | None, typer.Option(help="JSON {transform name: 4x4, m} to compare with.")] = None,
     out: Annotated[Path | None, typer.Option(help="Where to write the result (JSON).")] = None,
+    redetect: Annotated[
+        bool, typer.Option("--redetect", help="Detect the target anew in the session's recorded images.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Estimate and verify from captures, without any device.
@@ -70,7 +73,7 @@ def estimate(
     with ended_in_order():
         from tools.cli.estimate import EstimateOptions, estimate_captures
 
-        estimate_captures(EstimateOptions(captures, cell, method, truth, out, json))
+        estimate_captures(EstimateOptions(captures, cell, method, truth, out, redetect, json))
 
 
 @app.command()

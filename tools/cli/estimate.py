@@ -17,6 +17,7 @@ from dualcal_hal.session.result import Rejected, read_truth, with_truth_error, w
 from dualcal_hal.transforms import Array
 from procedures.analysis import analyse
 from procedures.calibrate import captures_of, finished
+from procedures.redetection import detect_anew
 from tools.cli.show import show_result
 from tools.cli.truth import simulated_truth
 
@@ -33,6 +34,7 @@ class EstimateOptions:
     method: str | None
     truth: Path | None
     out: Path | None
+    redetect: bool
     json: bool
 
 
@@ -44,6 +46,9 @@ def estimate_captures(options: EstimateOptions) -> None:
     file = load_cell(_cell_path(options), meshes=False)
     captures, unfinished = _captures(options.captures, file)
     console = Console(stderr=options.json)
+    if options.redetect:
+        captures, unseen = _detected_anew(console, options.captures, captures, file.cell)
+        unfinished = (*unfinished, *unseen)
     ours = captures.cell_sha256 == file.sha256
     if captures.cell_sha256 is not None and not ours:
         console.print(
@@ -51,7 +56,7 @@ def estimate_captures(options: EstimateOptions) -> None:
         )
     result = analyse(captures, file.cell, options.method or file.cell.procedure.method)
     if unfinished:
-        said = f"{len(unfinished)} captures of a constraint that is not finished left out"
+        said = f"{len(unfinished)} captures left out, the first {unfinished[0].id}: {unfinished[0].reason}"
         rejected = (*result.captures_rejected, *unfinished)
         result = replace(result, captures_rejected=rejected, reasons=(*result.reasons, said))
     truth = _truth(options.truth, file if ours else None)
@@ -106,6 +111,17 @@ def _read(path: Path, cell: CellConfig) -> Captures:
     joints = (cell.active.chain.joints, cell.passive.chain.joints)
     board, size = cell.target.board, cell.camera.intrinsics.size
     return read_captures(path, joints=joints, corners=len(board.corners), feature=board.feature, image_size=size)
+
+
+def _detected_anew(
+    console: Console, folder: Path, captures: Captures, cell: CellConfig
+) -> tuple[Captures, tuple[Rejected, ...]]:
+    """The captures with the corners that their recorded images show now, and those that show none."""
+    if not folder.is_dir():
+        raise UsageError(f"{folder}: --redetect needs the session's folder, which has the images")
+    anew = detect_anew(Session(folder), captures, cell)
+    console.print(f"detected anew in {len(anew.captures.captures)} images; {anew.moved}", highlight=False)
+    return anew.captures, anew.missed
 
 
 def _truth(path: Path | None, file: CellFile | None) -> Mapping[str, Array] | None:

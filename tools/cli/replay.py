@@ -13,6 +13,7 @@ from time import perf_counter
 import typer
 from rich.console import Console
 
+from dualcal_hal.camera import Image
 from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.errors import DualcalError, FrameMissing, Interrupted, LogDamaged, ReplayMismatch, UsageError
@@ -41,12 +42,16 @@ class ReplayOptions:
 
 @dataclass(frozen=True)
 class Replayed:
-    """result: None if the recorded run has none; ended: how that run ended then; times in s."""
+    """result: None if the recorded run has none; ended: how that run ended then; times in s.
+
+    served: whether detections were not worked out anew, because images were recorded with loss.
+    """
 
     result: Result | None
     ended: str
     recorded_time: float
     time: float
+    served: bool
     captures: Comparison
     results: Comparison | None
 
@@ -63,8 +68,8 @@ def replay_session(options: ReplayOptions) -> int:
     """Play a session back and compare; 0 if it came to the same."""
     file = _load(options.session)
     console = Console(stderr=options.json)
-    with _folder(options.out) as folder:
-        replayed = _replay(options.session, file, Session.create(folder, file.text))
+    with _session(options.out, file.text) as session:
+        replayed = _replay(options.session, file, session)
     if options.json:
         typer.echo(json.dumps(_document(replayed), indent=1, allow_nan=False))
     else:
@@ -87,13 +92,20 @@ def _load(session: Path) -> CellFile:
     return load_cell(path, [f"backends.{name}={entry}", *(f"{device}.backend={name}" for device in devices)])
 
 
+class _PassingSession(Session):
+    """A session whose folder is thrown away: nobody will look at its images."""
+
+    def write_image(self, name: str, image: Image) -> None:
+        pass
+
+
 @contextmanager
-def _folder(out: Path | None) -> Iterator[Path]:
+def _session(out: Path | None, cell_text: str) -> Iterator[Session]:
     if out is not None:
-        yield out
+        yield Session.create(out, cell_text)
         return
     with tempfile.TemporaryDirectory(prefix="dualcal-replay-") as folder:
-        yield Path(folder) / "session"
+        yield _PassingSession.create(Path(folder), cell_text)
 
 
 def _replay(recorded: Path, file: CellFile, session: Session) -> Replayed:
@@ -121,6 +133,7 @@ def _replay(recorded: Path, file: CellFile, session: Session) -> Replayed:
         ended,
         cell.clock.now(),
         perf_counter() - begun,
+        file.cell.session.frames != "png",
         compare_captures(there, taken),
         None if expected is None or result is None else compare_results(expected, result),
     )
@@ -133,6 +146,7 @@ def _document(replayed: Replayed) -> dict[str, object]:
         "recorded_run_ended": replayed.ended or None,
         "recorded_s": replayed.recorded_time,
         "replay_s": replayed.time,
+        "recorded_detections": replayed.served,
         "result": None if replayed.result is None else replayed.result.to_document(),
     }
 
@@ -145,6 +159,8 @@ def _show(console: Console, replayed: Replayed) -> None:
     say(f"{replayed.recorded_time:.0f} s of recorded time in {replayed.time:.1f} s, {faster:.0f} times as fast")
     if replayed.results is None:
         say(f"The recorded run has no result. It ended so: {replayed.ended or 'before it was analysed'}")
+    if replayed.served:
+        say("The images were recorded with loss: the recorded detections were taken in place of new ones.")
     what = "captures" if replayed.results is None else "result"
     if replayed.identical:
         say(

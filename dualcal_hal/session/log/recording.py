@@ -59,6 +59,9 @@ class Recording:
         """The same camera, with all that passes recorded."""
         return camera
 
+    def watch(self, robot: Robot) -> None:
+        """Keep the states that come from an open arm, for viewers, until :meth:`leave`."""
+
     def leave(self) -> None:
         """Ask nothing more of the devices: they are about to be closed."""
 
@@ -137,14 +140,14 @@ class LogRecording(Recording):
                 error.add_note(str(second))
 
     def robot(self, robot: Robot) -> Robot:
-        recorded = _RecordedRobot(robot, self)
+        return _RecordedRobot(robot, self)
 
+    def watch(self, robot: Robot) -> None:
         def show(state: RobotState) -> None:
             with suppress(LogNotWritten):  # told by the next command; the device's thread is not the place
                 self._log.joint_states(robot.name, state)
 
         self._leaving.append(robot.subscribe(show))
-        return recorded
 
     def camera(self, camera: Camera) -> Camera:
         return _RecordedCamera(camera, self)

@@ -42,14 +42,14 @@ class RunOptions:
     """What the command line says."""
 
     cell: Path
-    out: Path | None
-    seed: int | None
-    method: str | None
-    overrides: tuple[str, ...]
-    dry_run: bool
-    yes: bool
-    log: bool
-    json: bool
+    out: Path | None = None
+    seed: int | None = None
+    method: str | None = None
+    overrides: tuple[str, ...] = ()
+    dry_run: bool = False
+    yes: bool = False
+    log: bool = True
+    json: bool = False
 
 
 def run_cell(options: RunOptions) -> int:

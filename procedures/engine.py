@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dualcal_hal.cell import Arm, Cell
-from dualcal_hal.errors import ArmMoved, DualcalError, Interrupted, StopFailed
+from dualcal_hal.errors import ArmMoved, DualcalError, Interrupted, LogDamaged, StopFailed
 from dualcal_hal.guard import READ_TIMEOUT
 from dualcal_hal.robot import JointPath, Joints, Motion, RobotState
 from dualcal_hal.session.folder import Session
@@ -130,7 +130,7 @@ class Engine:
     def _work(self, work: Work) -> Any:
         answer = self._cell.answer(work.what, work.asked)
         if answer is not None and not (work.of_image and answer.images_are_exact):
-            return work.read(answer.result())
+            return _read_recorded(work, answer.result())
         try:
             result = work.body()
         except DualcalError as error:
@@ -213,6 +213,14 @@ class Engine:
         if failures:
             arms, reasons = ", ".join(failures), "; ".join(f"{name}: {why}" for name, why in failures.items())
             raise StopFailed(arms, "stop", reasons, "it may still move: use the emergency stop")
+
+
+def _read_recorded(work: Work, recorded: Any) -> Any:
+    try:
+        return work.read(recorded)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        what = f"what was worked out as {work.what} cannot be read ({type(error).__name__}: {error})"
+        raise LogDamaged("the log", None, what) from error
 
 
 def _reading_noise(encoder_sigma: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from datetime import UTC, datetime
 
@@ -212,6 +213,42 @@ def test_a_cut_log_and_a_damaged_one_are_told(session):
     result = dualcal("replay", session)
     assert result.exit_code == 1
     assert "log-0001.mcap" in result.output
+
+
+@pytest.mark.slow
+def test_wherever_a_log_is_cut_the_replay_says_so(session):
+    log = session / "log-0001.mcap"
+    whole = log.read_bytes()
+    for part in range(50):
+        log.write_bytes(whole[: len(whole) * part // 50])
+        result = dualcal("replay", session)
+        assert result.exit_code in (1, 2), part
+        assert re.search("the recording ends here|log-0001.mcap", result.output), (part, result.output)
+
+
+@pytest.mark.parametrize(
+    ("content", "code", "said"),
+    [(b"", 1, "the file is empty"), (b"no log at all, but some text", 1, "is no log")],
+)
+def test_a_file_that_is_no_log_is_told(session, content, code, said):
+    (session / "log-0001.mcap").write_bytes(content)
+    result = dualcal("replay", session)
+    assert result.exit_code == code
+    assert said in result.output
+
+
+def test_a_log_of_a_later_version_is_refused(session, monkeypatch):
+    monkeypatch.setattr("dualcal_hal.session.log.reader.FORMAT_VERSION", 0)
+    result = dualcal("replay", session)
+    assert result.exit_code == 2
+    assert "update it" in result.output
+
+
+def test_recorded_work_that_is_not_what_it_should_be_is_damage(recorded, monkeypatch):
+    monkeypatch.setattr("backends.replay.backend._result", lambda work: {"odd": 1})
+    result = dualcal("replay", recorded)
+    assert result.exit_code == 1
+    assert "what was worked out as stand-off cannot be read" in result.output
 
 
 @pytest.mark.parametrize("lacking", ["log-0001.mcap", "cell.yaml"])

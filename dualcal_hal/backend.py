@@ -34,11 +34,14 @@ class Backend(ABC):
 
     time: "drives" if it makes time (a simulator, a replay), "real" if it lives in it.
     simulated: whether no real device stands behind it.
+    repeats_targets: whether an arm that stands where it was sent before has the very pose that it had then, also
+    after the program was begun anew; a real arm may have been moved meanwhile.
     Options: the pydantic model of its entry under ``backends``.
     """
 
     time: ClassVar[Literal["drives", "real"]]
     simulated: bool
+    repeats_targets: ClassVar[bool] = False
     Options: ClassVar[type[BaseModel]]
 
     def __init__(self, name: str, cell: CellFile) -> None:
@@ -77,3 +80,17 @@ class Backend(ABC):
     def documents(self) -> Mapping[str, dict[str, Any]]:
         """JSON documents that are to be kept beside the run, by file name; asked for while it is open."""
         return {}
+
+    def left(self) -> dict[str, Any]:
+        """What it needs to go on from here in another process, as plain JSON; asked for while it is open.
+
+        Nothing for devices, which know themselves where they stand.
+        """
+        return {}
+
+    def go_on_from(self, state: Mapping[str, Any]) -> None:
+        """Have it be as it was when :meth:`left` gave ``state``, once it is opened; called before that.
+
+        FormatError for a state that is none of this cell's.
+        """
+        return  # devices are where they are

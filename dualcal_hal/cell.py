@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
@@ -12,7 +13,7 @@ from dualcal_hal.camera import Camera
 from dualcal_hal.cellfile import CellFile
 from dualcal_hal.clock import Clock, RealClock
 from dualcal_hal.config import RobotConfig
-from dualcal_hal.errors import UsageError
+from dualcal_hal.errors import FormatError, Problem, UsageError
 from dualcal_hal.geometry import CellGeometry
 from dualcal_hal.guard import CellGuard, GuardedRobot, JointLimits
 from dualcal_hal.kinematics import Chain
@@ -28,13 +29,18 @@ CAMERA_NAME = "camera"
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A robot with what the cell file knows of it."""
+    """A robot with what the cell file knows of it.
+
+    encoder_sigma, joint_sigma: rad that its readings and its arrivals scatter by; repeats_targets: as its backend's.
+    """
 
     robot: GuardedRobot
     chain: Chain
     limits: JointLimits
     home: Joints
     encoder_sigma: float
+    joint_sigma: float
+    repeats_targets: bool
 
 
 class Cell:
@@ -92,6 +98,19 @@ class Cell:
         """What the backends want kept beside the run, by file name; asked for while the cell is open."""
         return {name: document for backend in self._backends.values() for name, document in backend.documents().items()}
 
+    def left(self) -> dict[str, dict[str, Any]]:
+        """What the backends need to go on from here in another process, by their names; asked for while it is open."""
+        return {name: state for name, backend in self._backends.items() if (state := backend.left())}
+
+    def go_on_from(self, states: Mapping[str, Any]) -> None:
+        """Have the backends go on from what :meth:`left` gave, before they are opened; FormatError for other states."""
+        for name, state in states.items():
+            if name not in self._backends or not isinstance(state, Mapping):
+                raise FormatError(
+                    [Problem(f"backends.{name}", "the cell has no such backend, or this is no state of it")]
+                )
+            self._backends[name].go_on_from(state)
+
     @property
     def recording(self) -> Recording:
         """What is told of all that happens."""
@@ -107,7 +126,8 @@ class Cell:
         device = self._backends[config.backend].robot(name)
         self._recording.watch(device)
         robot = GuardedRobot(self._recording.robot(device), limits, self.clock)
-        return Arm(robot, config.chain, limits, tuple(map(float, config.home)), config.encoder_sigma)
+        home, repeats = tuple(map(float, config.home)), self._backends[config.backend].repeats_targets
+        return Arm(robot, config.chain, limits, home, config.encoder_sigma, config.joint_sigma, repeats)
 
 
 def _common_clock(backends: dict[str, Backend]) -> Clock:

@@ -70,6 +70,36 @@ def _load(path: Path, text: str, overrides: Sequence[str], context: Mapping[str,
     return CellFile(checked.cell, checked.simulation, text, hashlib.sha256(text.encode()).hexdigest())
 
 
+def with_own_meshes(file: CellFile) -> tuple[str, dict[str, Path]]:
+    """The text of a cell file that names its meshes by files of their own, and which file each of them is a copy of.
+
+    The names are relative, ``meshes/<hash of the content>.stl``; a text without meshes stays as it is.
+    """
+    copies: dict[str, Path] = {}
+    document = _Source("cell.yaml", file.text).document()
+    for name, fixture in file.cell.fixtures.items():
+        if fixture.mesh is not None:
+            original = Path(fixture.mesh.file)
+            digest = hashlib.sha256(original.read_bytes()).hexdigest()
+            own = f"meshes/{digest[:16]}{original.suffix.lower()}"
+            copies[own] = original
+            document["fixtures"][name]["mesh"]["file"] = own
+    return (_dumped(document) if copies else file.text), copies
+
+
+def differences(used: str, given: str) -> str:
+    """Where the text of one cell file says something else than the other's, as a diff; "" if all values are the same.
+
+    Comments and layout do not count.
+    """
+    documents = [_Source("cell.yaml", text).document() for text in (used, given)]
+    before, after = map(_plain, documents)
+    if before == after:
+        return ""
+    old, new = (_dumped(document).splitlines() for document in documents)
+    return "\n".join(difflib.unified_diff(old, new, "cell.yaml of the session", "as given", n=1, lineterm=""))
+
+
 def cell_schema() -> dict[str, Any]:
     """The JSON Schema (2020-12) of a cell file, units and meanings in the descriptions."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **CellDocument.model_json_schema()}

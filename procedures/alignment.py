@@ -152,14 +152,15 @@ class Servo:
     identity if the camera's orientation were known exactly.
     """
 
-    def __init__(self, jacobian: Array) -> None:
-        self._first = jacobian
-        self.jacobian = jacobian.copy()
+    def __init__(self, first: Array, jacobian: Array | None = None) -> None:
+        """``first`` (2, 2) is what it falls back on; ``jacobian`` (2, 2) what moves have made of it so far."""
+        self.first = first
+        self.jacobian = (first if jacobian is None else jacobian).copy()
 
     def step(self, lateral: Array) -> Array:
         """The shift (2,) in m in the believed camera plane that takes away an offset (2,) in m."""
         if np.linalg.cond(self.jacobian) > _WORST_CONDITION:
-            self.jacobian = self._first.copy()
+            self.jacobian = self.first.copy()
         shift = -np.linalg.solve(self.jacobian, lateral)
         return np.asarray(shift * min(1.0, LONGEST_STEP / max(float(np.linalg.norm(shift)), 1e-12)))
 
@@ -179,14 +180,14 @@ class Aligner:
         self._servo: Servo | None = None
 
     @property
-    def jacobian(self) -> Array | None:
-        """(2, 2), None before the first correction."""
-        return None if self._servo is None else self._servo.jacobian
+    def servo(self) -> Servo | None:
+        """As the points so far have left it, None before the first correction."""
+        return self._servo
 
-    def go_on_with(self, jacobian: Array | None) -> None:
-        """Use the Jacobian (2, 2) that an earlier position of this constraint ended with."""
-        if self._servo is None and jacobian is not None:
-            self._servo = Servo(jacobian)
+    def go_on_with(self, servo: Servo | None) -> None:
+        """Use what the position before ended with; None where it has needed no correction."""
+        if servo is not None:
+            self._servo = Servo(servo.first, servo.jacobian)
 
     def align(self, active: Joints, passive: Joints, T_P_T: Array, camera: Array) -> Procedure[Alignment]:
         """Bring the target from where it is to ``T_P_T`` and from there onto the axis.

@@ -6,7 +6,6 @@ improves; estimation and verification work on the captures alone and start from 
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -20,7 +19,16 @@ from dualcal_hal.session.captures import CaptureRecord, Captures
 from dualcal_hal.session.journal import Journal, StepKey
 from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Rejected
 from dualcal_hal.transforms import Array
-from procedures.alignment import Aligner, Alignment, AxisTrack, Outcome, point_on_axis, target_on_axis, tolerance_px
+from procedures.alignment import (
+    Aligner,
+    Alignment,
+    AxisTrack,
+    Outcome,
+    Servo,
+    point_on_axis,
+    target_on_axis,
+    tolerance_px,
+)
 from procedures.detection import Detector
 from procedures.detection.outcome import corners_from_record, corners_to_record
 from procedures.events import (
@@ -89,7 +97,7 @@ class LookRecord:
 class PointRecord:
     """What came of one position: a capture, or the outcome and reason it was given up for.
 
-    ``view`` is what the last picture showed, captured or not; ``servo`` (2, 2) the Jacobian to go on with;
+    ``view`` is what the last picture showed, captured or not; ``servo`` is what to go on with;
     ``arrivals_px`` the offsets (2,) that were left after small corrections.
     """
 
@@ -99,7 +107,7 @@ class PointRecord:
     offset_px: tuple[float, float] | None
     view: View | None
     capture: CaptureRecord | None
-    servo: Array | None
+    servo: Servo | None
     arrivals_px: tuple[Array, ...]
 
     def to_record(self) -> dict[str, Any]:
@@ -110,7 +118,8 @@ class PointRecord:
             "offset_px": self.offset_px,
             "view": _view_record(self.view),
             "capture": None if self.capture is None else self.capture.to_record(),
-            "servo": None if self.servo is None else self.servo.tolist(),
+            "servo": None if self.servo is None else self.servo.jacobian.tolist(),
+            "servo_first": None if self.servo is None else self.servo.first.tolist(),
             "arrivals_px": [offset.tolist() for offset in self.arrivals_px],
         }
 
@@ -124,7 +133,7 @@ class PointRecord:
             None if offset is None else (offset[0], offset[1]),
             _view_from(record["view"]),
             None if capture is None else CaptureRecord.from_record(capture),
-            None if servo is None else np.array(servo),
+            None if servo is None else Servo(np.array(record.get("servo_first") or servo), np.array(servo)),
             tuple(np.array(offset) for offset in record["arrivals_px"]),
         )
 
@@ -143,7 +152,6 @@ class Calibration:
         self._views: list[View] = []
         self._retreats: list[Posture] = [model.home]
         self._ways = WayFinder(model, self._belief, self._retreats)
-        self._arrivals = itertools.count()
 
     def steps(self) -> Procedure[None]:
         """First look, plan, calibration, verification, home."""
@@ -284,14 +292,13 @@ class Calibration:
         track = self._track(constraint, T_P_E)
         tolerance = tolerance_px(model, self._procedure.tolerance_px, self._arrivals_px)
         aligner = Aligner(model, belief, self._ways, self._detector, tolerance)
-        arrival = next(self._arrivals)
         for i, planned in enumerate(constraint.positions):
             T_P_T = target_on_axis(model, track, planned.passive, planned.distance)
             key = StepKey(constraint.use, constraint.name, i, "point")
 
             def body(i: int = i, near: Joints = planned.passive, goal: Array = T_P_T) -> Procedure[PointRecord]:
                 alignment = yield from aligner.align(constraint.active, near, goal, T_P_E)
-                return (yield from self._captured(constraint, i, arrival, alignment, aligner))
+                return (yield from self._captured(constraint, i, alignment, aligner))
 
             point = yield from task(key, body, PointRecord)
             yield from tell(_point_done(constraint, i, point))
@@ -305,7 +312,7 @@ class Calibration:
         return None
 
     def _captured(
-        self, constraint: PlannedConstraint, position: int, arrival: int, alignment: Alignment, aligner: Aligner
+        self, constraint: PlannedConstraint, position: int, alignment: Alignment, aligner: Aligner
     ) -> Procedure[PointRecord]:
         sighting, seen = alignment.sighting, alignment.detection
         view = None
@@ -319,7 +326,7 @@ class Calibration:
                 use=constraint.use,
                 constraint=constraint.name,
                 position=position,
-                active_arrival=arrival,
+                active_arrival=sighting.active_arrival,
                 active_joints=sighting.active,
                 passive_joints=sighting.passive,
                 feature=(float(seen.feature[0]), float(seen.feature[1])),
@@ -331,7 +338,7 @@ class Calibration:
             yield KeepImage(name, sighting.frame.image)
         offset = None if alignment.offset is None else (float(alignment.offset[0]), float(alignment.offset[1]))
         outcome, frames, reason = str(alignment.outcome), alignment.frames, alignment.reason
-        return PointRecord(outcome, frames, reason, offset, view, capture, aligner.jacobian, alignment.arrivals)
+        return PointRecord(outcome, frames, reason, offset, view, capture, aligner.servo, alignment.arrivals)
 
     def _track(self, constraint: PlannedConstraint, T_P_E: Array) -> AxisTrack:
         model = self._model
@@ -388,10 +395,19 @@ def requests_of(procedure: ProcedureConfig) -> list[Request]:
 
 def captures_of(journal: Journal, cell_sha256: str, started: str | None) -> Captures:
     """The captures of a run so far, in the order taken; without those of constraints that were given up."""
-    points = [(key, PointRecord.from_record(result)) for key, result in journal.results() if key.kind == "point"]
+    keys = [key for key, _ in journal.results() if key.kind == "point"]
+    points = [(key, journal.read(key, PointRecord.from_record)) for key in keys]
     given_up = {key.constraint for key, point in points if point.capture is None}
     captures = [point.capture for key, point in points if point.capture and key.constraint not in given_up]
     return Captures(cell_sha256, started, tuple(captures))
+
+
+def is_complete(captures: Captures, procedure: ProcedureConfig) -> bool:
+    """Whether nothing is left to be captured."""
+    kept, _ = finished(captures, procedure)
+    constraints = {(capture.use, capture.constraint) for capture in kept.captures}
+    done = Counter(use for use, _ in constraints)
+    return all(done[request.use] >= request.constraints for request in requests_of(procedure))
 
 
 def finished(captures: Captures, procedure: ProcedureConfig) -> tuple[Captures, tuple[Rejected, ...]]:

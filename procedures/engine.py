@@ -9,10 +9,19 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dualcal_hal.cell import Arm, Cell
-from dualcal_hal.errors import ArmMoved, DualcalError, Interrupted, LogDamaged, StopFailed
+from dualcal_hal.errors import (
+    ArmMoved,
+    DualcalError,
+    FormatError,
+    Interrupted,
+    LogDamaged,
+    Problem,
+    StopFailed,
+)
 from dualcal_hal.guard import READ_TIMEOUT
 from dualcal_hal.robot import JointPath, Joints, Motion, RobotState
 from dualcal_hal.session.folder import Session
+from dualcal_hal.session.journal import Left, Standing
 from procedures.observers import Observers
 from procedures.steps import (
     ArmReading,
@@ -37,6 +46,8 @@ GRAB_TIMEOUT = 2.0
 LATE_FACTOR, LATE_MARGIN = 2.0, 5.0
 """A motion is late after this factor of the time it needs at its speed, and this many seconds more."""
 
+_ARRIVAL_SIGMAS = 8
+
 
 class Engine:
     """Runs a procedure's steps on an open cell, and stops every arm it has moved on any exit."""
@@ -48,7 +59,15 @@ class Engine:
         self._observers = observers
         self._wake = threading.Event()
         self._abort_reason: str | None = None
+        self._arms = {arm.robot.name: arm for arm in (cell.active, cell.passive)}
+        self._moved: set[str] = set()
+        """Arms that this engine has moved: they are to be stopped."""
         self._commanded: dict[str, Joints] = {}
+        """Where the run, of which this may be a later part, sent the arms last."""
+        self._to_confirm: set[str] = set()
+        """Arms of which it has to be seen yet whether they still stand there."""
+        self._arrivals = dict.fromkeys(self._arms, 0)
+        self._go_on()
 
     def run(self, procedure: Procedure[T]) -> T:
         """The procedure's return value; Interrupted after :meth:`abort`; device errors as they are."""
@@ -59,6 +78,23 @@ class Engine:
             raise
         self._stop_all("the run has ended")
         return result
+
+    def _go_on(self) -> None:
+        """Begin where the journal ends."""
+        for name, arm in self._arms.items():
+            left = self._session.journal.left.arms.get(name)
+            if left is None:
+                # Journals of old do not say; arrivals were counted by constraints then, each with a step of its own.
+                self._arrivals[name] = len(self._session.journal.results())
+                continue
+            # An arm that may have been moved meanwhile, by whomever, counts as arrived anew.
+            self._arrivals[name] = left.arrival + (0 if arm.repeats_targets else 1)
+            if left.target is not None:
+                if len(left.target) != arm.robot.joints:
+                    where, what = str(self._session.journal.path), f"'{name}' has {arm.robot.joints} joints"
+                    raise FormatError([Problem(where, f"{what}, and was left with {len(left.target)}")])
+                self._commanded[name] = left.target
+                self._to_confirm.add(name)
 
     def abort(self, reason: str) -> None:
         """End the run at once: from any thread, any number of times; not from a signal's handler."""
@@ -120,12 +156,16 @@ class Engine:
     def _task(self, task: Task) -> Any:
         finished = self._session.journal.result(task.key)
         if finished is not None:
-            return task.result.from_record(finished)
+            return self._session.journal.read(task.key, task.result.from_record)
         self._recording.step_begun(task.key)
         result = self._drive(task.body())
         self._recording.step_finished(task.key)
-        self._session.journal.append(task.key, result.to_record())
+        self._session.journal.append(task.key, result.to_record(), self._left())
         return result
+
+    def _left(self) -> Left:
+        arms = {name: Standing(self._commanded.get(name), self._arrivals[name]) for name in self._arms}
+        return Left(arms, self._cell.left())
 
     def _work(self, work: Work) -> Any:
         answer = self._cell.answer(work.what, work.asked)
@@ -140,17 +180,29 @@ class Engine:
         return result
 
     def _reading(self, arm: Arm) -> ArmReading:
-        return ArmReading(arm.robot.read(READ_TIMEOUT), self._commanded.get(arm.robot.name))
+        state = self._read(arm)
+        return ArmReading(state, self._commanded.get(arm.robot.name))
+
+    def _read(self, arm: Arm) -> RobotState:
+        """The arm's state; where the run left it is believed only if it is seen there."""
+        state, name = arm.robot.read(READ_TIMEOUT), arm.robot.name
+        if name in self._to_confirm:
+            self._to_confirm.remove(name)
+            away = float(np.max(np.abs(np.subtract(state.positions, self._commanded[name]))))
+            if away > _reading_noise(arm.encoder_sigma) + _ARRIVAL_SIGMAS * arm.joint_sigma:
+                del self._commanded[name]
+        return state
 
     def _move(self, arm: Arm, waypoints: tuple[Joints, ...]) -> RobotState:
         limits = arm.limits
         path = JointPath(waypoints, tuple(map(float, limits.speed)), tuple(map(float, limits.acceleration)))
-        start = arm.robot.read(READ_TIMEOUT)
+        start = self._read(arm)
         ways = np.abs(np.diff([start.positions, *waypoints], axis=0))
         needed = np.max(ways / limits.speed + limits.speed / limits.acceleration, axis=1).sum()
         # Known as moved before the command leaves: a failure from here on finds the arm among those to stop.
-        self._commanded.pop(arm.robot.name, None)
+        self._moved.add(arm.robot.name)
         self._commanded[arm.robot.name] = waypoints[-1]
+        self._arrivals[arm.robot.name] += 1
         state = self._wait(arm.robot.start(path), LATE_FACTOR * float(needed) + LATE_MARGIN)
         return state
 
@@ -165,7 +217,7 @@ class Engine:
 
     def _look(self) -> Sighting:
         arms = (self._cell.active, self._cell.passive)
-        before = [arm.robot.read(READ_TIMEOUT) for arm in arms]
+        before = [self._read(arm) for arm in arms]
         frame = self._cell.camera.grab(self._cell.clock.now(), GRAB_TIMEOUT)
         after = [arm.robot.read(READ_TIMEOUT) for arm in arms]
         joints = []
@@ -181,7 +233,8 @@ class Engine:
                 )
             joints.append(tuple(map(float, np.mean([first.positions, last.positions], axis=0))))
         self._recording.stands(frame.time, {arm.robot.name: q for arm, q in zip(arms, joints, strict=True)})
-        return Sighting(frame, *joints)
+        active, passive = joints
+        return Sighting(frame, active, passive, self._arrivals[self._cell.active.robot.name])
 
     def _raise_if_aborted(self) -> None:
         if self._abort_reason is not None:
@@ -194,15 +247,15 @@ class Engine:
         except StopFailed as failure:
             error.add_note(str(failure))
             return
-        if self._commanded:
-            error.add_note(f"stopped: {', '.join(sorted(self._commanded))}")
+        if self._moved:
+            error.add_note(f"stopped: {', '.join(sorted(self._moved))}")
         else:
             error.add_note("no arm was moved")
 
     def _stop_all(self, cause: str) -> None:
         """Stop every arm that was moved, each whatever the others' stops do; StopFailed names those that may move."""
         failures: dict[str, str] = {}
-        for name in self._commanded:
+        for name in sorted(self._moved):
             try:
                 result = self._cell.arm(name).robot.stop(cause)
             except Exception as error:  # noqa: BLE001 - the other arm must still be stopped; told by StopFailed

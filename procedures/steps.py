@@ -37,7 +37,10 @@ R = TypeVar("R", bound=Record)
 
 @dataclass(frozen=True)
 class ArmReading:
-    """What an arm reports, and the target it was last sent to in this run (None before the first)."""
+    """What an arm reports, and the target it was last sent to in this run.
+
+    None before the first, and where a run goes on and the arm does not stand where it was left.
+    """
 
     state: RobotState
     commanded: Joints | None
@@ -51,11 +54,15 @@ class Readings:
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A frame with both arms' joint angles (rad), the mean of what was read before and after the exposure."""
+    """A frame with both arms' joint angles (rad), the mean of what was read before and after the exposure.
+
+    active_arrival: a number of its own for each time that the active arm arrives anew in the run.
+    """
 
     frame: Frame
     active: Joints
     passive: Joints
+    active_arrival: int
 
 
 @dataclass(frozen=True)

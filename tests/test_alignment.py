@@ -136,12 +136,12 @@ class Cell:
         self.renderer = Renderer(model.board, 0.01, model.intrinsics, 0.6)
         self.moves, self.shaken, self.hidden = [], 0, False
 
-    def align(self, tolerance=0.1, belief=None, jacobian=None):
+    def align(self, tolerance=0.1, belief=None, servo=None):
         belief = belief or self.model.nominal.as_if_looked()
         ways = WayFinder(self.model, belief, [self.model.home])
         detector = Detector(self.model.board, self.model.intrinsics.size)
         self.aligner = aligner = Aligner(self.model, belief, ways, detector, tolerance)
-        aligner.go_on_with(jacobian)
+        aligner.go_on_with(servo)
         camera = self.model.camera_in_passive(self.constraint.active, belief)
         planned = self.constraint.positions[0]
         goal = target_on_axis(self.model, AxisTrack(camera, 0.01, 1e-5), planned.passive, planned.distance)
@@ -170,7 +170,7 @@ class Cell:
                 if self.shaken:
                     self.shaken -= 1
                     raise ArmMoved("right", "take a picture", "a joint moved")
-                return Sighting(Frame(self.image(), 0.0, 1), *self.at.values())
+                return Sighting(Frame(self.image(), 0.0, 1), *self.at.values(), 1)
         pytest.fail(f"an unexpected step {step}")
 
     def state(self, q):
@@ -250,7 +250,7 @@ def test_the_jacobian_is_kept_along_the_constraint(model, plan):
     learned = Cell(model, plan, rolled_and_shifted(model))
     learned.align(belief=sure(model.nominal))
     again = Cell(model, plan, rolled_and_shifted(model))
-    found = again.align(belief=sure(model.nominal), jacobian=learned.aligner.jacobian)
+    found = again.align(belief=sure(model.nominal), servo=learned.aligner.servo)
     assert found.frames <= 3
 
 

@@ -61,6 +61,7 @@ def test_damaged_lines_and_unknown_versions_are_named_all_at_once(path):
 
 def test_what_json_cannot_hold_is_refused_and_nothing_is_written(path):
     journal = Journal(path)
+    journal.begin()
     before = path.read_bytes()
     with pytest.raises(ValueError, match="not JSON compliant"):
         journal.append(FIRST, {"x": float("nan")})
@@ -69,8 +70,10 @@ def test_what_json_cannot_hold_is_refused_and_nothing_is_written(path):
 
 def test_a_line_is_on_disk_before_its_step_counts_as_finished(path, monkeypatch):
     synced = []
+    journal = Journal(path)
+    journal.begin()
     monkeypatch.setattr("os.fsync", lambda descriptor: synced.append(path.read_bytes()))
-    Journal(path).append(FIRST, {"n": 1})
+    journal.append(FIRST, {"n": 1})
     assert synced[-1] == path.read_bytes()
     assert b'"n": 1' in synced[-1]
 

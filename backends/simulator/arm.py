@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from backends.simulator.left import ArmLeft
 from backends.simulator.mechanics import Approach
 from dualcal_hal.errors import CommandRefused, Contact, NotOpen
 from dualcal_hal.robot import JointPath, Joints, Mode, Motion, RobotState, StopResult
@@ -34,6 +35,26 @@ class SimulatedArm:
         self._begin = self._end = world.clock.now()
         self._settled: float | None = self._end
         self._error_before = self._error_after = world.joint_error(name, self.target)
+
+    def left(self) -> ArmLeft:
+        """How it came to its rest (call under the lock)."""
+        approach = self._approach
+        return ArmLeft(
+            target_rad=self.target,
+            joints_rad=tuple(self._stepper.sample(self._name, self._world.clock.now())[0].tolist()),
+            slack_rad=tuple(approach.slack.tolist()),
+            way=tuple(approach.way.tolist()),
+            rested_s=approach.end,
+            sequence=self._sequence,
+        )
+
+    def go_on_from(self, left: ArmLeft) -> None:
+        """Be at rest as the arm that gave ``left``; the stepper has it there already (call under the lock)."""
+        self._sequence = left.sequence
+        self.target = left.target_rad
+        self._approach = Approach(np.array(left.slack_rad), np.array(left.way), left.rested_s)
+        self._begin = self._end = self._settled = self._world.clock.now()
+        self._error_before = self._error_after = self._world.joint_error(self._name, self.target)
 
     def true_positions(self, when: float) -> Array:
         """(n,) rad at time ``when``, the error that the encoders do not see included."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict
 
 from backends.simulator.camera import Sight, SimulatedCamera
+from backends.simulator.left import CellLeft
 from backends.simulator.rendering import Renderer
 from backends.simulator.robot import SimulatedRobot
 from backends.simulator.scene import Scene
@@ -34,11 +36,13 @@ class SimulatorOptions(BaseModel):
 class SimulatorBackend(Backend):
     """Simulates a whole cell; CellFileError if a device of the cell is another backend's.
 
-    Its time is virtual and goes on over closing and opening; its arms are at home again after opening.
+    Its time is virtual and goes on over closing and opening; its arms are at home again after opening, unless it goes
+    on from where another was left.
     """
 
     time: ClassVar[Literal["drives", "real"]] = "drives"
     simulated = True
+    repeats_targets: ClassVar[bool] = True
     Options: ClassVar[type[BaseModel]] = SimulatorOptions
 
     def __init__(self, name: str, cell: CellFile) -> None:
@@ -47,6 +51,7 @@ class SimulatorBackend(Backend):
         stepper_class(self._simulation.stepper)  # refused now, before anything is begun
         self._clock = VirtualClock()
         self._open: Sight | None = None
+        self._left: CellLeft | None = None
         robots = cell.cell.robots.items()
         self._robots = {arm: SimulatedRobot(arm, config, self._opened_world) for arm, config in robots}
         self._camera = SimulatedCamera(CAMERA, self._opened, self._simulation.errors.motion_blur.exposure)
@@ -64,6 +69,9 @@ class SimulatorBackend(Backend):
         world = World(cell, simulation, self._clock)
         with ExitStack() as if_it_fails:
             if_it_fails.callback(world.close)
+            if self._left is not None:
+                world.go_on_from(self._left)
+                self._left = None
             if world.stepper.fault is not None:
                 raise Contact(self.name, "open", world.stepper.fault, "check home_deg and the bases in the cell file")
             bodies = world.stepper.scene
@@ -87,6 +95,17 @@ class SimulatorBackend(Backend):
 
     def documents(self) -> Mapping[str, dict[str, Any]]:
         return {} if self._open is None else self._open.world.documents()
+
+    def left(self) -> dict[str, Any]:
+        return {} if self._open is None else self._open.world.left(self._camera.frames).model_dump()
+
+    def go_on_from(self, state: Mapping[str, Any]) -> None:
+        left = CellLeft.read(state, self.name, self.cell.cell)
+        if self._clock.now() > left.clock_s:
+            raise UsageError(f"{self.name}: go on: its time has begun already; use a new one")
+        self._clock.wait(threading.Event(), left.clock_s)
+        self._camera.frames = left.frames
+        self._left = left
 
     def _opened(self, device: str, attempted: str) -> Sight:
         if self._open is None:

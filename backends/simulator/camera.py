@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,14 +33,17 @@ class Sight:
 
 
 class SimulatedCamera(Camera):
-    """``opened(device, attempted)`` gives what it looks at, or raises NotOpen; ``exposure``: s the shutter is open."""
+    """``opened(device, attempted)`` gives what it looks at, or raises NotOpen; ``exposure``: s the shutter is open.
+
+    frames: how many it has taken.
+    """
 
     def __init__(self, name: str, opened: Callable[[str, str], Sight], exposure: float) -> None:
         self.name = name
         self._opened = opened
         self._exposure = exposure
         self._latency = max(LATENCY, exposure)
-        self._sequence = itertools.count(1)
+        self.frames = 0
 
     def grab(self, not_before: float, timeout: float) -> Frame:
         """What is behind the target, or before it, is where it was at the exposure's start."""
@@ -60,7 +62,8 @@ class SimulatedCamera(Camera):
             T_E_T = world.T_E_T(begin)
             view = None if sight.scene is None else sight.scene.view(T_E_T)
             noise = world.sample_noise(self.name, "frame")
-            sequence = next(self._sequence)
+            self.frames += 1
+            sequence = self.frames
         image = sight.renderer.expose([T_E_T, *self._later_poses(world, begin)], view)
         self._wait(world, begin + self._latency)
         return Frame(_with_noise(image, noise, world.noise.image_grey), begin, sequence)

@@ -6,6 +6,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from backends.simulator.trajectory import Trajectory
 from dualcal_hal.errors import CellFileError, Problem
 from dualcal_hal.robot import JointPath, Joints
@@ -44,6 +46,11 @@ class Stepper(ABC):
         trajectory.brake(now)
         return trajectory.end
 
+    def stand(self, joints: Mapping[str, tuple[Joints, Array]], now: float) -> None:
+        """Have each arm be at rest from ``now`` on: where it was sent, and the angles (n,) at which its joints are."""
+        for arm, (target, _) in joints.items():
+            self._trajectories[arm].rest(np.array(target), now)
+
     def destination(self, arm: str) -> Joints:
         """The joint angles in rad at which an arm is to rest, or does."""
         return self._trajectories[arm].destination
@@ -56,8 +63,8 @@ class Stepper(ABC):
     def next_look(self, arm: str, now: float) -> float | None:
         """When to look again whether an arm has settled; None once it has, or has halted by the ``fault``."""
 
-    def documents(self) -> Mapping[str, dict[str, Any]]:
-        """What it measured that is to be kept beside the run, by file name."""
+    def documents(self, now: float) -> Mapping[str, dict[str, Any]]:
+        """What it has measured up to now that is to be kept beside the run, by file name."""
         return {}
 
     @abstractmethod

@@ -57,6 +57,10 @@ class Trajectory:
             position = np.array(waypoint)
         self._phases, self._rest = tuple(phases), position
 
+    def rest(self, at: Array, since: float) -> None:
+        """Be at rest at joint angles (n,) in rad, since a time in s."""
+        self._phases, self._rest, self.end = (), np.array(at, dtype=float), since
+
     def brake(self, now: float) -> None:
         """Come to rest on the path as fast as the arm can."""
         position, velocity = self.sample(now)

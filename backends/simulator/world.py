@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from backends.simulator.arm import SimulatedArm
+from backends.simulator.left import CellLeft
 from backends.simulator.noise import generator
 from backends.simulator.stepper import Stepper, stepper_class
 from backends.simulator.truth import Truth
@@ -69,7 +70,26 @@ class World:
     def documents(self) -> Mapping[str, dict[str, Any]]:
         """What was measured in it, by file name."""
         with self.lock:
-            return self.stepper.documents()
+            return self.stepper.documents(self.clock.now())
+
+    def left(self, frames: int) -> CellLeft:
+        """How it stands now, both arms at rest, after so many frames."""
+        with self.lock:
+            samples: dict[str, dict[str, int]] = {}
+            for (device, stream), count in self._samples.items():
+                samples.setdefault(device, {})[stream] = count
+            arms = {name: arm.left() for name, arm in self.arms.items()}
+            return CellLeft(clock_s=self.clock.now(), arms=arms, samples=samples, frames=frames)
+
+    def go_on_from(self, left: CellLeft) -> None:
+        """Stand as a world that gave ``left``, whose time it is by the clock."""
+        with self.lock:
+            joints = {name: (arm.target_rad, np.array(arm.joints_rad)) for name, arm in left.arms.items()}
+            self.stepper.stand(joints, self.clock.now())
+            for name, arm in left.arms.items():
+                self.arms[name].go_on_from(arm)
+            counts = {(device, stream): n for device, of in left.samples.items() for stream, n in of.items()}
+            self._samples = Counter(counts)
 
     def close(self) -> None:
         """End all motions and all waiting."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,6 +14,8 @@ from dualcal_hal.session.files import read_document, write_atomically, write_doc
 from dualcal_hal.session.images import encode_png
 from dualcal_hal.session.journal import Journal
 
+CELL_FILE = "cell.yaml"
+
 
 class Session:
     """``cell.yaml`` as used, ``plan.json``, ``journal.jsonl``, ``captures.json``, ``images/``, ``result.json``."""
@@ -22,16 +25,30 @@ class Session:
         self.journal = Journal(folder / "journal.jsonl")
 
     @classmethod
-    def create(cls, folder: Path, cell_text: str) -> Self:
-        """A new session in an empty or not yet existing folder, else UsageError."""
+    def create(
+        cls, folder: Path, cell_text: str, started: str | None = None, copies: Mapping[str, Path] | None = None
+    ) -> Self:
+        """A new session, begun at a time (ISO 8601), in an empty or not yet existing folder, else UsageError.
+
+        copies: files that the cell file needs, by their paths in the session.
+        """
         try:
             if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
                 raise UsageError(f"{folder}: exists and is not an empty folder; name another with --out")
             (folder / "images").mkdir(parents=True)
-            write_atomically(folder / "cell.yaml", cell_text.encode())
+            for name, original in (copies or {}).items():
+                (folder / name).parent.mkdir(exist_ok=True)
+                write_atomically(folder / name, original.read_bytes())
+            write_atomically(folder / CELL_FILE, cell_text.encode())
+            session = cls(folder)
+            session.journal.begin(started)
         except OSError as error:
             raise UsageError(f"{folder}: cannot be written: {error.strerror}") from error
-        return cls(folder)
+        return session
+
+    @property
+    def cell_path(self) -> Path:
+        return self.folder / CELL_FILE
 
     @property
     def captures_path(self) -> Path:

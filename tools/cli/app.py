@@ -28,7 +28,13 @@ Json = Annotated[bool, typer.Option("--json", help="Print result.json alone on s
 
 @app.command()
 def run(
-    cell: Cell,
+    cell: Annotated[
+        Path | None,
+        typer.Argument(metavar="[CELL]", help="The cell file (YAML); a session brings its own.", show_default=False),
+    ] = None,
+    resume: Annotated[
+        Path | None, typer.Option("--resume", metavar="SESSION", help="Go on with a session that was interrupted.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Session folder. Default: sessions/<time>-<cell>.")] = None,
     seed: Annotated[int | None, typer.Option(help="Sets procedure.seed and simulation.seed.")] = None,
     method: Method = None,
@@ -45,12 +51,12 @@ def run(
     """Calibrate a cell: look, plan, align and capture, estimate, verify.
 
     Exit code 0 for verdict ok, 1 for any other verdict or a device fault, 2 for a call, cell file or captures that
-    cannot be used or when there is no plan, 130 when interrupted.
+    cannot be used or when there is no plan, 130 when interrupted. A session that is finished is reported again.
     """
     with ended_in_order():
         from tools.cli.run import RunOptions, run_cell
 
-        code = run_cell(RunOptions(cell, out, seed, method, tuple(overrides or ()), dry_run, yes, log, json))
+        code = run_cell(RunOptions(cell, out, seed, method, tuple(overrides or ()), dry_run, yes, log, json, resume))
     raise typer.Exit(code)
 
 

@@ -116,7 +116,7 @@ def _replay(recorded: Path, file: CellFile, session: Session) -> Replayed:
     try:
         with signals_deferred() as signals:
             execute(cell, calibration, session, lambda event: None, lambda engine: signals.pass_on_to(engine.abort))
-        captures = write_session_captures(file, session, None)
+        captures = write_session_captures(file, session)
         analyse_session(file, session, captures)
         # Read as the recorded one is: what is compared is what the files say.
         result = read_result(session.result_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,18 +14,19 @@ import typer
 from rich.console import Console
 
 from dualcal_hal.cell import Cell
-from dualcal_hal.cellfile import CellFile, load_cell
+from dualcal_hal.cellfile import CellFile, differences, load_cell, with_own_meshes
 from dualcal_hal.clock import utc_now
-from dualcal_hal.errors import UsageError
+from dualcal_hal.errors import FormatError, Problem, UsageError
 from dualcal_hal.session.captures import Captures, write_captures
-from dualcal_hal.session.distances import read_distances
-from dualcal_hal.session.folder import Session
+from dualcal_hal.session.distances import DISTANCES, Distances, read_distances
+from dualcal_hal.session.folder import CELL_FILE, Session
+from dualcal_hal.session.lock import SessionLock
 from dualcal_hal.session.log import next_segment
 from dualcal_hal.session.log.recording import LogRecording, Recording
-from dualcal_hal.session.result import Result, with_truth_error, write_result
+from dualcal_hal.session.result import Result, read_result, with_truth_error, write_result
 from procedures.alignment import largest_alignment_error, tolerance_px
 from procedures.analysis import analyse
-from procedures.calibrate import Calibration, captures_of
+from procedures.calibrate import Calibration, captures_of, is_complete
 from procedures.engine import Engine
 from procedures.observers import Observer, Observers
 from procedures.planning.model import CellModel
@@ -41,7 +43,7 @@ from tools.cli.truth import simulated_truth
 class RunOptions:
     """What the command line says."""
 
-    cell: Path
+    cell: Path | None
     out: Path | None = None
     seed: int | None = None
     method: str | None = None
@@ -50,13 +52,18 @@ class RunOptions:
     yes: bool = False
     log: bool = True
     json: bool = False
+    resume: Path | None = None
 
 
 def run_cell(options: RunOptions) -> int:
     """Prepare, run, analyse; returns the exit code."""
-    file = _load(options)
     # With --json standard output is for the result alone.
     console = Console(stderr=options.json)
+    if options.resume is not None:
+        return _resume(console, options, options.resume)
+    if options.cell is None:
+        raise UsageError("name a cell file, or with --resume a session to go on with")
+    file = _load(options, options.cell)
     model = CellModel(file.cell)
     calibration = Calibration(file.cell, model)
     cell = Cell(file)
@@ -67,26 +74,115 @@ def run_cell(options: RunOptions) -> int:
     require_reach(file.cell, model)
     _confirm(cell, options.yes)
     started = utc_now()
-    session = Session.create(options.out or _unused_folder(started, file.cell.name), file.text)
+    text, meshes = with_own_meshes(file)
+    folder = options.out or _unused_folder(started, file.cell.name)
+    session = Session.create(folder, text, started.isoformat(timespec="seconds"), meshes)
+    with _kept(session), SessionLock(session.folder):
+        if meshes:
+            file = load_cell(session.cell_path)
+            calibration, cell = Calibration(file.cell, CellModel(file.cell)), Cell(file)
+        return _report(console, options, file, session, _finish(console, options, file, cell, calibration, session))
+
+
+def _resume(console: Console, options: RunOptions, folder: Path) -> int:
+    """Go on with a session, or report it again."""
+    if options.out is not None or options.dry_run:
+        raise UsageError("--resume goes on in the session's own folder: it takes neither --out nor --dry-run")
+    file = _file_of(options, folder)
+    if (session := Session(folder)).result_path.exists() and _is_finished(file, session):
+        return _report(console, options, file, session, read_result(session.result_path))
+    with SessionLock(folder) as lock:
+        if lock.left_by is not None:
+            _say(console, f"{folder}: taken over from {lock.left_by}, which has ended without giving it back")
+        session = Session(folder)  # as it is now that nobody else writes it
+        with _kept(session):
+            steps = session.journal.results()
+            _say(console, f"going on with {folder}: {len(steps)} steps are finished")
+            if is_complete(captures := _captures(file, session), file.cell.procedure):
+                _say(console, "all is captured already: only the analysis is left, and no arm is moved")
+                write_captures(session.captures_path, captures)
+                result = conclude(file, session, captures)
+            else:
+                model = CellModel(file.cell)
+                calibration, cell = Calibration(file.cell, model), Cell(file)
+                _confirm(cell, options.yes)
+                result = _finish(console, options, file, cell, calibration, session)
+            return _report(console, options, file, session, result)
+
+
+def _file_of(options: RunOptions, folder: Path) -> CellFile:
+    """The cell file of a session; UsageError with a diff if the command line asks for another."""
+    session_file = folder / CELL_FILE
+    if not folder.is_dir():
+        raise UsageError(f"{folder}: there is no such session")
+    if not session_file.exists():
+        raise UsageError(f"{folder}: there is no {CELL_FILE} in it, so it is no session that could go on")
+    file = load_cell(session_file)
+    given, _ = with_own_meshes(_load(options, options.cell or session_file))
+    if diff := differences(file.text, given):
+        raise UsageError(f"{folder}: the session was begun with another cell file than is asked for now:\n{diff}")
+    return file
+
+
+def _is_finished(file: CellFile, session: Session) -> bool:
+    # The picture is the last that is written.
+    return session.summary_path.exists() and is_complete(_captures(file, session), file.cell.procedure)
+
+
+def _finish(
+    console: Console, options: RunOptions, file: CellFile, cell: Cell, calibration: Calibration, session: Session
+) -> Result:
+    """Run from where the session's journal ends, and analyse."""
+    go_on_from_journal(cell, session)
     with _recording(options, session, file, cell) as recording:
         cell.record(recording)
-        captures = _run(console, file, cell, calibration, session, started)
+        captures = _run(console, file, cell, calibration, session)
         result = conclude(file, session, captures)
         recording.document(session.result_path.name, result.to_document())
-    show_result(console, file.cell, result, simulated_truth(file), as_json=options.json)
+    return result
+
+
+def go_on_from_journal(cell: Cell, session: Session) -> None:
+    """Have the backends be as the last finished step left them, before they are opened."""
+    try:
+        cell.go_on_from(session.journal.left.backends)
+    except FormatError as error:
+        where = session.journal.path
+        raise FormatError([Problem(f"{where}: {each.where}", each.what) for each in error.problems]) from error
+
+
+def _report(console: Console, options: RunOptions, file: CellFile, session: Session, result: Result) -> int:
+    if options.json:
+        typer.echo(session.result_path.read_text(), nl=False)
+    else:
+        show_result(console, file.cell, result, simulated_truth(file), as_json=False)
     if (distances := read_distances(session)) is not None:
-        console.print(f"least distance between the arms {distances.least()}", highlight=False)
-    console.print(f"session: {session.folder}", soft_wrap=True, highlight=False)
+        _say(console, f"least distance between the arms {distances.least()}")
+    _say(console, f"session: {session.folder}")
     return 0 if result.verdict == "ok" else FAULT
+
+
+def _say(console: Console, line: str) -> None:
+    console.print(line, markup=False, soft_wrap=True, highlight=False)
+
+
+@contextmanager
+def _kept(session: Session) -> Iterator[None]:
+    """Whatever ends the run, say how to go on."""
+    try:
+        yield
+    except BaseException as error:
+        folder = shlex.quote(str(session.folder))
+        error.add_note(f"the session is kept; to go on with it: dualcal run --resume {folder}")
+        error.add_note(f"what it has so far: dualcal estimate {folder}")
+        raise
 
 
 def _recording(options: RunOptions, session: Session, file: CellFile, cell: Cell) -> Recording:
     return LogRecording(next_segment(session.folder), file, cell.clock) if options.log else Recording()
 
 
-def _run(
-    console: Console, file: CellFile, cell: Cell, calibration: Calibration, session: Session, started: datetime
-) -> Captures:
+def _run(console: Console, file: CellFile, cell: Cell, calibration: Calibration, session: Session) -> Captures:
     """The run itself; its captures are written however it ends."""
     with signals_deferred() as signals:
         try:
@@ -94,11 +190,13 @@ def _run(
                 execute(cell, calibration, session, watcher, lambda engine: signals.pass_on_to(engine.abort))
         except BaseException as error:
             try:
-                write_session_captures(file, session, started)
+                write_session_captures(file, session)
             except OSError as second:
                 error.add_note(f"captures.json could not be written ({second.strerror}); the journal has them")
+            except FormatError:
+                pass  # a damaged journal is what the run has ended by
             raise
-        return write_session_captures(file, session, started)
+        return write_session_captures(file, session)
 
 
 def _rehearse(console: Console, file: CellFile, model: CellModel, options: RunOptions) -> None:
@@ -115,15 +213,15 @@ def _rehearse(console: Console, file: CellFile, model: CellModel, options: RunOp
     console.print(f"plan and picture: {session.folder}", soft_wrap=True, highlight=False)
 
 
-def _load(options: RunOptions) -> CellFile:
+def _load(options: RunOptions, path: Path) -> CellFile:
     overrides = list(options.overrides)
     if options.method is not None:
         overrides.append(f"procedure.method={options.method}")
     if options.seed is not None:
         overrides.append(f"procedure.seed={options.seed}")
-        if load_cell(options.cell, options.overrides).simulation is not None:
+        if load_cell(path, options.overrides).simulation is not None:
             overrides.append(f"simulation.seed={options.seed}")
-    return load_cell(options.cell, overrides)
+    return load_cell(path, overrides)
 
 
 def _unused_folder(started: datetime, name: str) -> Path:
@@ -132,12 +230,15 @@ def _unused_folder(started: datetime, name: str) -> Path:
     return folder if not folder.exists() else next(other for other in numbered if not other.exists())
 
 
-def write_session_captures(file: CellFile, session: Session, started: datetime | None) -> Captures:
+def write_session_captures(file: CellFile, session: Session) -> Captures:
     """``captures.json`` from the journal."""
-    begun = None if started is None else started.isoformat(timespec="seconds")
-    captures = captures_of(session.journal, file.sha256, begun)
+    captures = _captures(file, session)
     write_captures(session.captures_path, captures)
     return captures
+
+
+def _captures(file: CellFile, session: Session) -> Captures:
+    return captures_of(session.journal, file.sha256, session.journal.started)
 
 
 def execute(
@@ -148,36 +249,34 @@ def execute(
     begun: Callable[[Engine], None] = lambda engine: None,
 ) -> None:
     """Run the procedure on the cell's devices, which are closed again on any exit; ``begun`` gets the engine."""
-    try:
-        with Observers(watcher) as observers, cell as opened:
-            engine = Engine(opened, session, observers)
-            begun(engine)
-            with _documents_kept(opened, session):
-                engine.run(calibration.steps())
-    except Exception as error:
-        error.add_note(
-            f"the session is kept in {session.folder}; what it has so far: dualcal estimate {session.folder}"
-        )
-        raise
+    with Observers(watcher) as observers, cell as opened:
+        engine = Engine(opened, session, observers)
+        begun(engine)
+        with _documents_kept(opened, session):
+            engine.run(calibration.steps())
 
 
 @contextmanager
 def _documents_kept(cell: Cell, session: Session) -> Iterator[None]:
-    """Write what the backends measured over the run, also over one that failed."""
+    """Write what the backends measured over the run, also over one that failed, behind what they did before."""
+    earlier = read_distances(session)
     try:
         yield
     except BaseException as error:
         try:
-            _write_documents(cell, session)
+            _write_documents(cell, session, earlier)
         except OSError as second:
             error.add_note(f"what the backends measured could not be written ({second.strerror})")
         raise
-    _write_documents(cell, session)
+    _write_documents(cell, session, earlier)
 
 
-def _write_documents(cell: Cell, session: Session) -> None:
+def _write_documents(cell: Cell, session: Session, earlier: Distances | None) -> None:
     for name, document in cell.documents().items():
-        session.write_document(name, document)
+        if name == DISTANCES and earlier is not None:
+            session.write_document(name, Distances.from_document(document).after(earlier).to_document())
+        else:
+            session.write_document(name, document)
 
 
 def conclude(file: CellFile, session: Session, captures: Captures) -> Result:

@@ -14,6 +14,7 @@ from backends.simulator.bullet.bodies import STEP, BulletBodies
 from backends.simulator.bullet.nearness import Near, Nearness
 from backends.simulator.stepper import Stepper
 from dualcal_hal.robot import JointPath
+from dualcal_hal.robot import Joints as Target
 from dualcal_hal.session.distances import DISTANCES, Distances
 from dualcal_hal.transforms import Array
 
@@ -43,7 +44,7 @@ class BulletStepper(Stepper):
 
     def __init__(self, cell: CellConfig, truth: Truth) -> None:
         super().__init__(cell, truth)
-        self._time = 0.0
+        self._time = self._begun = 0.0
         self._moving: list[str] = []
         self._past: deque[tuple[float, Joints]] = deque(maxlen=_KEPT)
         self._steps = itertools.count()
@@ -55,6 +56,17 @@ class BulletStepper(Stepper):
             self._past.append((0.0, {arm: self.scene.joints(arm) for arm in self.scene.arms}))
             self._halt_on_contact(self._past[0][1])
             if_it_fails.pop_all()
+
+    def stand(self, joints: Mapping[str, tuple[Target, Array]], now: float) -> None:
+        super().stand(joints, now)
+        for arm, (target, q) in joints.items():
+            self.scene.put(arm, q)
+            self.scene.drive(arm, np.array(target), np.zeros_like(q))
+        self._time = self._begun = now
+        self._past.clear()
+        self._past.append((now, {arm: self.scene.joints(arm) for arm in self.scene.arms}))
+        self._nearness = Nearness(self.scene)
+        self._halt_on_contact(self._past[0][1])
 
     def follow(self, arm: str, path: JointPath, now: float) -> float:
         self._advance(now)
@@ -79,9 +91,10 @@ class BulletStepper(Stepper):
         self._advance(now)
         return self._time + STEP if arm in self._moving else None
 
-    def documents(self) -> Mapping[str, dict[str, Any]]:
+    def documents(self, now: float) -> Mapping[str, dict[str, Any]]:
         times, nears = [time for time, _ in self._distances], [near for _, near in self._distances]
-        distances = Distances(times, [near.distance for near in nears], [(near.first, near.second) for near in nears])
+        between = [(near.first, near.second) for near in nears]
+        distances = Distances(times, [near.distance for near in nears], between, [(self._begun, now)])
         return {DISTANCES: distances.to_document()}
 
     def close(self) -> None:

@@ -409,23 +409,6 @@ def _further_away(original):
     return pose
 
 
-# -- going on with a run ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("finished", [0, 3, 7, 11])
-def test_a_run_begun_anew_on_its_journal_ends_with_the_same_captures_to_the_last_bit(session, tmp_path, finished):
-    """On one in which nothing is finished it is the same seed's whole run once more."""
-    folder = tmp_path / "resumed"
-    shutil.copytree(session, folder)
-    lines = (session / "journal.jsonl").read_bytes().splitlines(keepends=True)
-    (folder / "journal.jsonl").write_bytes(b"".join(lines[: 1 + finished]))
-    file = load_cell(folder / "cell.yaml")
-    resumed = Session(folder)
-    execute(Cell(file), Calibration(file.cell, CellModel(file.cell)), resumed, lambda event: None)
-    captures = captures_of(resumed.journal, file.sha256, None).captures
-    assert captures == read_captures(session / "captures.json").captures
-
-
 # -- dry run ---------------------------------------------------------------------------------------
 
 

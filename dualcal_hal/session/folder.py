@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from dualcal_hal.camera import Image
-from dualcal_hal.errors import UsageError
-from dualcal_hal.session.files import read_document, write_atomically, write_document
+from dualcal_hal.errors import FormatError, UsageError
+from dualcal_hal.session.files import read_document, read_object, write_atomically, write_document
 from dualcal_hal.session.images import encode_png
 from dualcal_hal.session.journal import Journal
 
@@ -45,6 +46,14 @@ class Session:
         except OSError as error:
             raise UsageError(f"{folder}: cannot be written: {error.strerror}") from error
         return session
+
+    @property
+    def started(self) -> str | None:
+        """When the run was begun first (ISO 8601), None if nothing tells."""
+        if self.journal.started is None and self.captures_path.exists():
+            with suppress(FormatError):
+                return read_object(self.captures_path).get("started")
+        return self.journal.started
 
     @property
     def cell_path(self) -> Path:

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.config import CellConfig
-from dualcal_hal.errors import UsageError
+from dualcal_hal.errors import FormatError, UsageError
 from dualcal_hal.session.captures import Captures, read_captures
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.result import Rejected, read_truth, with_truth_error, write_result
@@ -101,10 +101,25 @@ def _captures(path: Path, file: CellFile) -> tuple[Captures, tuple[Rejected, ...
     source = path / "captures.json" if path.is_dir() else path
     if not (folder / "journal.jsonl").exists():
         return _read(source, cell), ()
-    if not source.exists():
-        # A run that was killed had no time to write its captures; its journal has them.
-        return finished(captures_of(Session(folder).journal, file.sha256, None), cell.procedure)
-    return finished(_read(source, cell), cell.procedure)
+    written = _read(source, cell) if source.exists() else None
+    if path.is_dir():
+        # A run that was killed had no time to write its captures, or left those of an earlier part.
+        journalled = _journalled(folder, file, required=written is None)
+        if written is None or (journalled is not None and len(journalled.captures) > len(written.captures)):
+            written = journalled
+    assert written is not None  # what is named exists
+    return finished(written, cell.procedure)
+
+
+def _journalled(folder: Path, file: CellFile, *, required: bool) -> Captures | None:
+    """The captures that the session's journal has; None for a damaged one that is not required."""
+    try:
+        journal = Session(folder).journal
+        return captures_of(journal, file.sha256, None)
+    except FormatError:
+        if required:
+            raise
+        return None
 
 
 def _read(path: Path, cell: CellConfig) -> Captures:

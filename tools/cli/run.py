@@ -95,6 +95,7 @@ def _resume(console: Console, options: RunOptions, folder: Path) -> int:
         if lock.left_by is not None:
             _say(console, f"{folder}: taken over from {lock.left_by}, which has ended without giving it back")
         session = Session(folder)  # as it is now that nobody else writes it
+        session.journal.begin(utc_now().isoformat(timespec="seconds"))
         with _kept(session):
             steps = session.journal.results()
             _say(console, f"going on with {folder}: {len(steps)} steps are finished")
@@ -238,7 +239,7 @@ def write_session_captures(file: CellFile, session: Session) -> Captures:
 
 
 def _captures(file: CellFile, session: Session) -> Captures:
-    return captures_of(session.journal, file.sha256, session.journal.started)
+    return captures_of(session.journal, file.sha256, session.started)
 
 
 def execute(

@@ -32,7 +32,7 @@ from procedures.planning.model import CellModel
 from procedures.planning.poses import PosePlanner
 from procedures.planning.refine import arrival_scatter
 from procedures.planning.ways import WayFinder
-from procedures.steps import ArmReading, Look, Move, Read, Readings, Sighting
+from procedures.steps import ArmReading, Look, Mark, Move, Read, Readings, Sighting, Work
 from tests.cells import paper_cell
 
 T_P_E = transform(rotation_from_vector([0.3, -0.5, 0.8]), [0.4, -0.1, 0.6])
@@ -171,6 +171,10 @@ class Cell:
                     self.shaken -= 1
                     raise ArmMoved("right", "take a picture", "a joint moved")
                 return Sighting(Frame(self.image(), 0.0, 1), *self.at.values(), 1)
+            case Work():
+                return step.body()
+            case Mark():
+                return None
         pytest.fail(f"an unexpected step {step}")
 
     def state(self, q):
@@ -252,6 +256,15 @@ def test_the_jacobian_is_kept_along_the_constraint(model, plan):
     again = Cell(model, plan, rolled_and_shifted(model))
     found = again.align(belief=sure(model.nominal), servo=learned.aligner.servo)
     assert found.frames <= 3
+
+
+def test_a_constraint_goes_on_with_what_its_last_position_has_learned(model, plan):
+    aligner = Aligner(model, model.nominal, None, None, 0.1)
+    for learned in ([[1.0, 0.1], [0.0, 1.0]], [[0.9, 0.1], [0.0, 1.0]]):
+        aligner.go_on_with(Servo(np.eye(2), np.array(learned)))
+    aligner.go_on_with(None)  # a position that needed no correction
+    np.testing.assert_array_equal(aligner.servo.first, np.eye(2))
+    np.testing.assert_array_equal(aligner.servo.jacobian, [[0.9, 0.1], [0.0, 1.0]])
 
 
 def test_a_target_that_is_not_seen_is_lost(model, plan):

@@ -529,6 +529,22 @@ def test_the_least_distance_is_told_with_its_parts_and_its_time() -> None:
     assert distances.least() == "61 mm: link 6 of left to target of right, at 12.3 s"
 
 
+def test_of_a_run_that_went_on_the_least_distance_is_that_of_all_its_parts() -> None:
+    first = Distances([1.0, 2.0], [0.2, 0.05], [("a", "b"), ("c", "d")], [(0.0, 2.5)])
+    second = Distances([2.1, 4.0], [0.3, 0.1], [("a", "b"), ("a", "b")], [(2.0, 5.0)])
+    both = Distances.from_document(json.loads(json.dumps(second.after(first).to_document())))
+    assert both.least() == "50 mm: c to d, at 2.0 s"
+    assert both.missing == 0.0
+
+
+def test_a_part_that_was_killed_and_left_no_distances_is_told() -> None:
+    resumed = Distances([31.0], [0.1], [("a", "b")], [(30.0, 50.0)])
+    assert resumed.least() == "100 mm: a to b, at 31.0 s; not known for 30 s of a part that was killed"
+    again = Distances([71.0], [0.2], [("a", "b")], [(60.0, 80.0)]).after(resumed)
+    assert again.missing == 40.0
+    assert Distances([], [], [], [(5.0, 5.0)]).least() == "not measured; not known for 5 s of a part that was killed"
+
+
 # Runs
 
 

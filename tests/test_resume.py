@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,9 @@ from dualcal_hal.session.folder import Session
 from dualcal_hal.session.journal import Journal
 from dualcal_hal.session.lock import LOCK, SessionLock
 from dualcal_hal.transforms import rotation_angle
+from procedures.planning.ways import WayFinder
 from tests.test_run import dualcal, sets
+from tools.benchmarks.kills import differences_from, kill_many, survive
 
 TINY = Path(__file__).parent.parent / "cells" / "tiny.yaml"
 LEFT_BEHIND = ("result.json", "summary.png", "captures.json", "distances.json")
@@ -189,6 +192,46 @@ def test_in_physics_a_run_that_goes_on_comes_to_the_same_within_a_hundredth_of_a
     assert "not known" not in resumed.stdout
 
 
+def test_a_run_that_is_killed_goes_on_to_the_same_and_keeps_what_it_reported(session, tmp_path):
+    moments = iter([4.0, None])
+    trial = survive(TINY, (), tmp_path / "s", session, lambda: next(moments))
+    assert trial.wrong == []
+    assert len(trial.kills) == 1
+
+
+@pytest.mark.slow
+def test_runs_that_are_killed_at_any_moment_go_on_to_the_same(tmp_path):
+    trials = kill_many(TINY, (), 5, random.Random(3), tmp_path)
+    assert [wrong for trial in trials for wrong in trial.wrong] == []
+    assert sum(len(trial.kills) for trial in trials) == 5
+
+
+def test_the_script_that_kills_runs_tells_what_is_missing_or_differs(session, tmp_path):
+    shutil.copytree(session, tmp_path / "s")
+    for name, change in (
+        ("captures.json", lambda document: document["captures"].pop()),
+        ("result.json", lambda document: document.update(verdict="fail")),
+    ):
+        document = json.loads((session / name).read_text())
+        change(document)
+        (tmp_path / "s" / name).write_text(json.dumps(document))
+    lines = (session / "journal.jsonl").read_bytes().splitlines(keepends=True)
+    (tmp_path / "s" / "journal.jsonl").write_bytes(b"".join(lines[:-1]))
+    (tmp_path / "s" / "images" / "calibration-00-1.png").unlink()
+    (tmp_path / "s" / "log-0001.mcap").write_bytes((session / "log-0001.mcap").read_bytes().replace(b"calib", b"CALIB"))
+    wrong = differences_from(tmp_path / "s", session, {"verification/00/2"})
+    assert len(wrong) >= 5
+    for words in (
+        "verification/00/2 was reported",
+        "calibration-00-1.png",
+        "captures.json differs",
+        "result.json differs",
+    ):
+        assert any(words in line for line in wrong)
+    assert any("log-0001.mcap" in line for line in wrong)
+    assert differences_from(session, session, {"verification/00/2"}) == []
+
+
 def test_the_start_that_is_told_is_the_first_one(interrupted):
     folder = interrupted(6)
     started = Session(folder).journal.started
@@ -270,6 +313,16 @@ def test_only_arms_that_were_moved_since_are_told_to_stop(interrupted, lose_the_
     result = dualcal("run", "--resume", folder)
     assert result.exit_code == 1
     assert "stopped: right" in result.stderr
+
+
+def test_an_arm_that_stands_where_it_was_left_within_its_scatter_is_believed_to(interrupted, monkeypatch):
+    """Planning then begins at where it was sent, not at a reading of that."""
+    folder, asked = interrupted(7), []
+    find = WayFinder.find
+    monkeypatch.setattr(WayFinder, "find", lambda self, *query: asked.append(query[0]) or find(self, *query))
+    left = Session(folder).journal.left.arms
+    assert dualcal("run", "--resume", folder).exit_code == 0
+    assert (asked[0].active, asked[0].passive) == (left["left"].target, left["right"].target)
 
 
 # -- finished and captured -------------------------------------------------------------------------

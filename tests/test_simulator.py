@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import threading
 from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +26,7 @@ from backends.simulator.trajectory import Trajectory
 from backends.simulator.world import World
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.clock import VirtualClock
-from dualcal_hal.errors import CellFileError, CommandRefused, DeviceError, MotionStopped, NotOpen
+from dualcal_hal.errors import CellFileError, CommandRefused, DeviceError, MotionStopped, NotOpen, UsageError
 from dualcal_hal.registry import backend_class
 from dualcal_hal.robot import JointPath, Joints, Motion, MotionState, RobotState
 from dualcal_hal.transforms import Array
@@ -392,3 +394,72 @@ def test_image_noise_has_the_stated_sigma_and_is_new_in_each_frame() -> None:
     runs.close()
     backend.close()
     assert (first - second).std() / math.sqrt(2) == pytest.approx(math.hypot(3.0, math.sqrt(1 / 12)), rel=0.01)
+
+
+# Going on in another process
+
+
+ERRORS = (
+    "simulation.errors={kinematics: {angle_deg: 0.02}, backlash: {gap_mrad: 0.5}, compliance: {sag_mrad: 1}, "
+    "base_drift: {translation_mm_per_hour: 100, rotation_deg_per_hour: 5}, "
+    "thermal: {growth_ppm: 500, time_constant_min: 0.2}, mount_flex: {mrad_per_g: 0.5}, "
+    "target_slip: {translation_mm: 1, at_s: 3}, settle_time: {amplitude_mrad: 1}, time_skew: {delay_s: 0.03}, "
+    "motion_blur: {exposure_ms: 10}}"
+)
+
+
+def seen(backend: SimulatorBackend) -> list[Any]:
+    """All that its devices tell, and where the target truly is in the camera, before, while and after an arm moves."""
+    told: list[Any] = []
+    for name, offset in ((PASSIVE, 0.05), (ACTIVE, -0.02), (PASSIVE, 0.04)):
+        told += [backend.robot(arm).read(TIMEOUT) for arm in (ACTIVE, PASSIVE)]
+        told += [backend.clock.now(), backend._opened_world("test", "look").T_E_T(backend.clock.now()).tolist()]
+        frame = backend.camera("camera").grab(backend.clock.now(), TIMEOUT)
+        told += [frame.time, frame.sequence, frame.image.tobytes()]
+        told.append(move(backend, name, away(name, offset)))
+    return told
+
+
+def left_after_some_time(backend: SimulatorBackend) -> dict[str, Any]:
+    """What it needs to go on, after it has been in a file."""
+    for name, offset in ((ACTIVE, 0.1), (PASSIVE, 0.2), (PASSIVE, 0.1)):
+        move(backend, name, away(name, offset))
+        readings(backend)
+        backend.camera("camera").grab(backend.clock.now(), TIMEOUT)
+    state: dict[str, Any] = json.loads(json.dumps(backend.left()))
+    return state
+
+
+@pytest.mark.parametrize("overrides", [(), (ERRORS,)], ids=["noise", "errors"])
+def test_another_simulator_goes_on_to_the_last_bit_from_where_one_was_left(overrides: tuple[str, ...]) -> None:
+    first, second = (SimulatorBackend("sim", cell(*overrides)) for _ in range(2))
+    first.open(TIMEOUT)
+    state = left_after_some_time(first)
+    second.go_on_from(state)
+    second.open(TIMEOUT)
+    assert second.left() == first.left()
+    assert seen(second) == seen(first)
+    for backend in (first, second):
+        backend.close()
+
+
+def test_what_is_left_holds_nothing_of_the_truth(noisy: SimulatorBackend) -> None:
+    state = left_after_some_time(noisy)
+    assert set(state) == {"clock_s", "arms", "samples", "frames"}
+    told = {"target_rad", "joints_rad", "slack_rad", "way", "rested_s", "sequence"}
+    assert all(set(arm) == told for arm in state["arms"].values())
+    assert state["arms"][PASSIVE]["joints_rad"] == list(away(PASSIVE, 0.1))  # not where the links truly are
+
+
+def test_its_time_goes_on_before_it_is_opened(noisy: SimulatorBackend) -> None:
+    state = left_after_some_time(noisy)
+    backend = SimulatorBackend("sim", cell())
+    backend.go_on_from(state)
+    assert backend.clock.now() == state["clock_s"] == noisy.clock.now()
+
+
+def test_one_whose_time_is_later_already_does_not_go_back(noisy: SimulatorBackend) -> None:
+    state = left_after_some_time(noisy)
+    move(noisy, PASSIVE, away(PASSIVE, 0.0))
+    with pytest.raises(UsageError, match="its time has begun already"):
+        noisy.go_on_from(state)

@@ -69,11 +69,15 @@ def survive(
     if code != 0:
         trial.wrong.append(f"exit code {code}: {errors.strip() or output.strip()[-500:]}")
         return trial
-    trial.wrong += _missing(folder, trial.reported)
-    trial.wrong += [f"{name} differs" for name in ("captures.json", "result.json") if _differs(name, folder, reference)]
-    trial.wrong += _damage(folder)
+    trial.wrong += differences_from(folder, reference, trial.reported)
     trial.files_of_log = len(segment_paths(folder))
     return trial
+
+
+def differences_from(folder: Path, reference: Path, reported: set[str]) -> list[str]:
+    """How a finished session is not as one that nothing has interrupted, or lacks points that were reported as done."""
+    differing = [f"{name} differs" for name in ("captures.json", "result.json") if _differs(name, folder, reference)]
+    return [*_missing(folder, reported), *differing, *_damage(folder)]
 
 
 def _run(arguments: Sequence[str], moment: float | None) -> tuple[int | None, str, str, float]:

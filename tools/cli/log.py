@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from dualcal_hal.errors import LogDamaged
+from dualcal_hal.errors import LogDamaged, LogNotWritten, UsageError
 from dualcal_hal.session.log.check import Checked, check_log
 from dualcal_hal.session.log.export import export_log
 from dualcal_hal.session.log.info import Info, Topic, log_info
@@ -77,7 +78,8 @@ def recover(session: Path, out: Path | None, *, as_json: bool) -> int:
                 _say(f"{path}: is whole; nothing to recover")
             continue
         try:
-            recovered = recover_log(path, _recovered_path(path, out))
+            with _refused_if_not_writable():
+                recovered = recover_log(path, _recovered_path(path, out))
         except LogDamaged as error:
             code = DAMAGED
             documents.append({"file": str(path), "recovered": None, "error": str(error)})
@@ -93,7 +95,8 @@ def recover(session: Path, out: Path | None, *, as_json: bool) -> int:
 
 def export(session: Path, out: Path | None, *, as_json: bool) -> int:
     """Tables and frames; 1 if damage ended it early."""
-    exported = export_log(session, out or (session if session.is_dir() else session.parent) / "export")
+    with _refused_if_not_writable():
+        exported = export_log(session, out or (session if session.is_dir() else session.parent) / "export")
     if as_json:
         document = asdict(exported) | {"folder": str(exported.folder)}
         _print_json(document, as_json)
@@ -108,6 +111,15 @@ def export(session: Path, out: Path | None, *, as_json: bool) -> int:
         if exported.damage is not None:
             _say(f"damaged: {exported.damage}")
     return GOOD if exported.damage is None else DAMAGED
+
+
+@contextmanager
+def _refused_if_not_writable() -> Iterator[None]:
+    """Where no device waits for a log, one that cannot be written is a wrong call."""
+    try:
+        yield
+    except LogNotWritten as error:
+        raise UsageError(str(error)) from error
 
 
 def _recovered_path(path: Path, out: Path | None) -> Path:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import platform
-import sys
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from importlib.metadata import distributions
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -38,6 +37,8 @@ from dualcal_hal.session.log.writer import LogWriter
 from dualcal_hal.transforms import Array
 
 T = TypeVar("T")
+
+_PACKAGES = ("dualcal", "numpy", "scipy", "opencv-python-headless", "coal", "pybullet", "mcap", "protobuf")
 
 
 class Recording:
@@ -330,7 +331,9 @@ def _answered(
 
 
 def _versions() -> dict[str, str]:
-    """Of all that takes part, and of the machine."""
-    packages = {each.metadata["Name"]: each.version for each in distributions() if each.metadata["Name"]}
-    machine = f"{platform.machine()} {platform.system()} {platform.release()}"
-    return {"python": sys.version.split()[0], "machine": machine, **dict(sorted(packages.items()))}
+    """Of all that has a share in the numbers."""
+    versions = {"python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}"}
+    for package in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    return versions

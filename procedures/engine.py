@@ -168,11 +168,12 @@ class Engine:
         return Left(arms, self._cell.left())
 
     def _work(self, work: Work) -> Any:
-        answer = self._cell.answer(work.what, work.asked)
-        if answer is not None and not (work.of_image and answer.images_are_exact):
-            return _read_recorded(work, answer.result())
         try:
-            result = work.body()
+            answer = self._cell.answer(work.what, work.asked)
+            if answer is None or (work.of_image and answer.images_are_exact):
+                result = work.body()
+            else:
+                result = _read_recorded(work, answer.result())
         except DualcalError as error:
             self._recording.worked(work.what, work.asked, None, error)
             raise

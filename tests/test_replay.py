@@ -133,6 +133,8 @@ def test_a_cell_file_may_name_a_recording(recorded, tmp_path):
     result = dualcal("run", tmp_path / "cell.yaml", *run, "--out", tmp_path / "new")
     assert result.exit_code == 0, result.output
     assert json.loads((tmp_path / "new/result.json").read_text()) == json.loads((recorded / "result.json").read_text())
+    shutil.rmtree(tmp_path / "old")
+    assert "to the last bit" in dualcal("replay", tmp_path / "new").output, "it was recorded in its turn"
 
 
 def test_a_run_that_failed_is_replayed_up_to_its_failure(tmp_path, monkeypatch):

@@ -70,13 +70,20 @@ def _load(path: Path, text: str, overrides: Sequence[str], context: Mapping[str,
     return CellFile(checked.cell, checked.simulation, text, hashlib.sha256(text.encode()).hexdigest())
 
 
-def with_own_meshes(file: CellFile) -> tuple[str, dict[str, Path]]:
-    """The text of a cell file that names its meshes by files of their own, and which file each of them is a copy of.
+def standing_alone(file: CellFile) -> tuple[str, dict[str, Path]]:
+    """The text of a cell file for another folder, and which file each of the files that it needs there is a copy of.
 
-    The names are relative, ``meshes/<hash of the content>.stl``; a text without meshes stays as it is.
+    Meshes are named ``meshes/<hash of the content>.stl``, what backends read by its whole path; a text that names
+    neither stays as it is.
     """
     copies: dict[str, Path] = {}
     document = _Source("cell.yaml", file.text).document()
+    moved = False
+    for name, entry in file.cell.backends.items():
+        for option, value in entry.checked:
+            if isinstance(value, Path) and str(value) != document["backends"][name].get(option):
+                document["backends"][name][option] = str(value)
+                moved = True
     for name, fixture in file.cell.fixtures.items():
         if fixture.mesh is not None:
             original = Path(fixture.mesh.file)
@@ -84,7 +91,7 @@ def with_own_meshes(file: CellFile) -> tuple[str, dict[str, Path]]:
             own = f"meshes/{digest[:16]}{original.suffix.lower()}"
             copies[own] = original
             document["fixtures"][name]["mesh"]["file"] = own
-    return (_dumped(document) if copies else file.text), copies
+    return (_dumped(document) if copies or moved else file.text), copies
 
 
 def differences(used: str, given: str) -> str:

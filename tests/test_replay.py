@@ -137,6 +137,21 @@ def test_a_cell_file_may_name_a_recording(recorded, tmp_path):
     assert "to the last bit" in dualcal("replay", tmp_path / "new").output, "it was recorded in its turn"
 
 
+def test_a_played_back_run_is_begun_anew_rather_than_gone_on_with(recorded, tmp_path):
+    cell = (recorded / "cell.yaml").read_text().replace("{type: simulator}", "{type: replay, session: old}")
+    (tmp_path / "cell.yaml").write_text(cell)
+    shutil.copytree(recorded, tmp_path / "old")
+    new = tmp_path / "new"
+    assert dualcal("run", tmp_path / "cell.yaml", "--out", new).exit_code == 0
+    journal = (new / "journal.jsonl").read_bytes().splitlines(keepends=True)
+    (new / "result.json").unlink()
+    for steps, exit_code in ((1, 2), (0, 0)):
+        (new / "journal.jsonl").write_bytes(b"".join(journal[: 1 + steps]))
+        result = dualcal("run", "--resume", new)
+        assert result.exit_code == exit_code, result.output
+        assert ("run it anew from its beginning" in result.output) == (steps > 0)
+
+
 def test_a_run_that_failed_is_replayed_up_to_its_failure(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         lose_the_link(patch, at_move=18)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -96,6 +97,17 @@ class ReplayBackend(Backend):
             raise ReplayMismatch.at(WORK, work.index, work.asked, asked, f"{what}: {differs}")
         timeline.take_work()
         return Answer(lambda: _result(work), images_are_exact)
+
+    def left(self) -> dict[str, Any]:
+        """That something was played back."""
+        return {"played_back": str(self._session)}
+
+    def go_on_from(self, state: Mapping[str, Any]) -> None:
+        """UsageError: a recording is played from its beginning, and that takes no arm's time."""
+        raise UsageError(
+            f"{self.name}: what was played back from {self._session} cannot be gone on with: "
+            f"run it anew from its beginning, or dualcal replay {self._session}"
+        )
 
     def _opened(self, device: str, attempted: str) -> Timeline:
         if self._timeline is None:

@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 
 from dualcal_hal.cell import Cell
-from dualcal_hal.cellfile import CellFile, differences, load_cell, with_own_meshes
+from dualcal_hal.cellfile import CellFile, differences, load_cell, standing_alone
 from dualcal_hal.clock import utc_now
 from dualcal_hal.errors import FormatError, Problem, UsageError
 from dualcal_hal.session.captures import Captures, write_captures
@@ -74,11 +74,11 @@ def run_cell(options: RunOptions) -> int:
     require_reach(file.cell, model)
     _confirm(cell, options.yes)
     started = utc_now()
-    text, meshes = with_own_meshes(file)
+    text, copies = standing_alone(file)
     folder = options.out or _unused_folder(started, file.cell.name)
-    session = Session.create(folder, text, started.isoformat(timespec="seconds"), meshes)
+    session = Session.create(folder, text, started.isoformat(timespec="seconds"), copies)
     with _kept(session), SessionLock(session.folder):
-        if meshes:
+        if text != file.text:
             file = load_cell(session.cell_path)
             calibration, cell = Calibration(file.cell, CellModel(file.cell)), Cell(file)
         return _report(console, options, file, session, _finish(console, options, file, cell, calibration, session))
@@ -119,7 +119,7 @@ def _file_of(options: RunOptions, folder: Path) -> CellFile:
     if not session_file.exists():
         raise UsageError(f"{folder}: there is no {CELL_FILE} in it, so it is no session that could go on")
     file = load_cell(session_file)
-    given, _ = with_own_meshes(_load(options, options.cell or session_file))
+    given, _ = standing_alone(_load(options, options.cell or session_file))
     if diff := differences(file.text, given):
         raise UsageError(f"{folder}: the session was begun with another cell file than is asked for now:\n{diff}")
     return file

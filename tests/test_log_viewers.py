@@ -18,6 +18,7 @@ from dualcal_hal.session.log import LogWriter, Note, foxglove
 from dualcal_hal.session.log.layout import RECORD_TOPICS
 from dualcal_hal.transforms import rotation_from_vector, transform
 from tools.benchmarks.mutated_logs import STARTED, write_sample
+from tools.golden import GOLDEN
 
 SECOND = 10**9
 IMAGE = np.random.default_rng(1).integers(0, 256, (30, 40), dtype=np.uint8)
@@ -125,7 +126,8 @@ def test_every_topic_has_its_schema(tmp_path):
 
 @pytest.mark.skipif(shutil.which("rerun") is None, reason="rerun is not installed")
 def test_rerun_finds_nothing_wrong_with_it(tmp_path):
-    path = tmp_path / "log-0001.mcap"
-    write_sample(path)
-    done = subprocess.run(["rerun", "mcap", "check", path], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    sample = tmp_path / "log-0001.mcap"
+    write_sample(sample)
+    for path in (sample, GOLDEN / "log-0001.mcap"):
+        done = subprocess.run(["rerun", "mcap", "check", path], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr

@@ -12,10 +12,14 @@ import numpy as np
 import pytest
 
 from dualcal_hal.camera import Frame
+from dualcal_hal.cellfile import load_cell
+from dualcal_hal.clock import RealClock
 from dualcal_hal.errors import LogNotWritten
-from dualcal_hal.robot import Mode, RobotState
+from dualcal_hal.robot import Mode, Robot, RobotState, StopResult
 from dualcal_hal.session.images import encode_png
 from dualcal_hal.session.log import Call, FrameRef, LogReader, LogWriter, Note, Picture, Reply, Worked, writer
+from dualcal_hal.session.log.recording import LogRecording
+from tests.cells import TINY
 from tools.benchmarks.mutated_logs import STARTED
 
 IMAGES = np.random.default_rng(1).integers(0, 256, (8, 40, 50), dtype=np.uint8)
@@ -106,6 +110,68 @@ def test_a_disk_that_is_behind_slows_the_run_and_drops_nothing(path, monkeypatch
         assert told == [pytest.approx(log.slowed, abs=0.2)], "it is told once, not for each frame"
     found, _ = items(path)
     assert [picture.sequence for picture in found] == list(range(len(IMAGES)))
+
+
+def test_no_disk_stands_between_a_stop_and_the_next_arm(path, monkeypatch):
+    """The disk takes nothing, the backlog is full, and another thread waits for it with a command of its own."""
+    recording = LogRecording(path, load_cell(TINY), RealClock())
+    gate = Gate(monkeypatch)
+    monkeypatch.setattr(writer, "LARGEST_BACKLOG", 1)
+    arms = [StandingArm(name) for name in ("left", "right")]
+    left, right = map(recording.robot, arms)
+    waiting = threading.Thread(target=left.read, args=(1.0,))
+    stops = threading.Thread(target=lambda: [arm.stop("enough") for arm in (left, right)])
+    with recording:
+        left.read(1.0)
+        waiting.start()
+        waiting.join(0.2)
+        behind = waiting.is_alive()
+        stops.start()
+        stops.join(5.0)
+        stopped = [arm.stopped for arm in arms]
+        gate.open.set()
+        stops.join()
+        waiting.join()
+    assert behind
+    assert stopped == ["enough", "enough"]
+    calls = [(item.device, item.method) for item in items(path)[0] if isinstance(item, Call)]
+    assert calls.count(("right", "stop")) == 1
+    assert calls.count(("left", "read")) == 2
+
+
+class StandingArm(Robot):
+    joints = 6
+
+    def __init__(self, name):
+        self.name = name
+        self.stopped = None
+
+    def read(self, timeout):
+        return RobotState((0.0,) * 6, (0.0,) * 6, Mode.READY, (), 0.0, 0)
+
+    def stop(self, reason):
+        self.stopped = reason
+        return StopResult(True)
+
+    def subscribe(self, function):
+        return lambda: None
+
+    def start(self, path):
+        raise NotImplementedError
+
+    enable = disable = reset_fault = start
+
+
+def test_a_log_that_could_not_be_begun_leaves_no_file(path, monkeypatch):
+    """Which a replay would have to make sense of."""
+
+    def full(self):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(writer.FileWriter, "sync", full)
+    with pytest.raises(LogNotWritten, match="No space left"):
+        LogRecording(path, load_cell(TINY), RealClock())
+    assert not path.exists()
 
 
 def test_one_that_is_larger_than_the_backlog_is_taken_alone(path, monkeypatch):

@@ -107,8 +107,11 @@ class LogWriter:
     """A segment of a run's log, written by a thread of its own. Any thread may call it.
 
     Nothing is dropped: who brings more than the disk takes waits, and ``on_slow`` is called, by whoever waited and
-    at most every 10 s, with the seconds waited in all. When the disk fails, the next call raises LogNotWritten and
-    so does every later one. Times are seconds of the clock; ``clock_started`` is what it showed at ``started`` (UTC).
+    at most every 10 s, with the seconds waited in all. What is told of arms that may be moving never waits, so that no
+    disk stands between a stop and an arm; of that there is little between two calls that wait. When the disk fails, the
+    next call raises LogNotWritten and so does every later one.
+
+    Times are seconds of the clock; ``clock_started`` is what it showed at ``started`` (UTC).
     """
 
     def __init__(
@@ -155,6 +158,7 @@ class LogWriter:
             _sync_folder(path.parent)
         except OSError as error:
             self._release(error)
+            path.unlink(missing_ok=True)  # nothing is in it
             raise self._not_written(error) from error
         self._thread = threading.Thread(target=self._serve, name="log writer", daemon=True)
         self._thread.start()
@@ -167,14 +171,23 @@ class LogWriter:
     ) -> None:
         self.close()
 
-    # What is written. All of it blocks while the disk is behind, and raises LogNotWritten once it has failed.
+    # What is written. It blocks while the disk is behind, unless it says otherwise, and raises LogNotWritten once the
+    # disk has failed.
 
-    def record(self, record: Record) -> None:
+    def await_room(self) -> None:
+        """Return when what waits to be written is less than the backlog's bound."""
+        begun = time.perf_counter()
+        with self._change:
+            self._change.wait_for(lambda: self._has_room(0))
+        self._raise_failure()
+        self._tell_if_slow(time.perf_counter() - begun)
+
+    def record(self, record: Record, *, wait: bool = True) -> None:
         """A record; a Note is shown to viewers too. ValueError for one that JSON cannot hold or that is too large."""
         data = to_json(record)
         if len(data) > LONGEST_RECORD:
             raise ValueError(f"a {type(record).__name__} of {len(data)} bytes is too large for the log")
-        self._message(RECORD_TOPICS[type(record)], record.time, data)
+        self._message(RECORD_TOPICS[type(record)], record.time, data, wait=wait)
         if isinstance(record, Note):
             line = foxglove.log(record.level, record.text, self._nanoseconds(record.time))
             self._message(LOG_TOPIC, record.time, line.SerializeToString())
@@ -194,9 +207,9 @@ class LogWriter:
         self._put(_Job(write, frame.image.nbytes))
 
     def joint_states(self, arm: str, state: RobotState) -> None:
-        """What an arm reports, for viewers and tables."""
+        """What an arm reports, for viewers and tables; never waits."""
         message = foxglove.joint_states(arm, state, self._nanoseconds(state.time))
-        self._message(joint_states_topic(arm), state.time, message.SerializeToString(), state.sequence)
+        self._message(joint_states_topic(arm), state.time, message.SerializeToString(), state.sequence, wait=False)
 
     def calibration(self, intrinsics: Intrinsics, when: float) -> None:
         """The camera's intrinsics, for viewers."""
@@ -249,10 +262,10 @@ class LogWriter:
 
     # Between the threads
 
-    def _message(self, topic: str, when: float, data: bytes, sequence: int | None = None) -> None:
+    def _message(self, topic: str, when: float, data: bytes, sequence: int | None = None, *, wait: bool = True) -> None:
         _require_size(topic, data)
         stamp = self._nanoseconds(when)
-        self._put(_Job(lambda: self._writer.write(topic, stamp, data, sequence), len(data)))
+        self._put(_Job(lambda: self._writer.write(topic, stamp, data, sequence), len(data)), wait=wait)
 
     def _nanoseconds(self, clock: float) -> int:
         since = clock - self._clock_started
@@ -261,10 +274,11 @@ class LogWriter:
             return self._started
         return min(max(0, self._started + round(since * 1e9)), _LATEST)
 
-    def _put(self, job: _Job) -> None:
+    def _put(self, job: _Job, *, wait: bool = True) -> None:
         begun = time.perf_counter()
         with self._change:
-            self._change.wait_for(lambda: self._has_room(job.size))
+            if wait:
+                self._change.wait_for(lambda: self._has_room(job.size))
             if self._failure is None:
                 if self._closing:
                     raise LogNotWritten(f"{self.path}: the log is closed")

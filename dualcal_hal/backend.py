@@ -77,6 +77,13 @@ class Backend(ABC):
         """
         return None
 
+    def procedure_ended(self) -> None:
+        """The procedure has come to its good end, and asks nothing more; called while it is open.
+
+        Raises ReplayMismatch where a recorded run went on.
+        """
+        return  # devices expect nothing
+
     def documents(self) -> Mapping[str, dict[str, Any]]:
         """JSON documents that are to be kept beside the run, by file name; asked for while it is open."""
         return {}

@@ -94,6 +94,11 @@ class Cell:
         answers = (backend.answer(what, asked) for backend in self._backends.values())
         return next((answer for answer in answers if answer is not None), None)
 
+    def procedure_ended(self) -> None:
+        """Tell the backends that the procedure asks nothing more, see :meth:`Backend.procedure_ended`."""
+        for backend in self._backends.values():
+            backend.procedure_ended()
+
     def documents(self) -> dict[str, dict[str, Any]]:
         """What the backends want kept beside the run, by file name; asked for while the cell is open."""
         return {name: document for backend in self._backends.values() for name, document in backend.documents().items()}

@@ -83,6 +83,11 @@ class Motion:
         self._listeners: list[Callable[[], None]] = []
 
     @property
+    def device(self) -> str:
+        """The arm that moves."""
+        return self._device
+
+    @property
     def state(self) -> MotionState:
         return self._state
 

@@ -77,6 +77,7 @@ class Engine:
             self._stop_after(error)
             raise
         self._stop_all("the run has ended")
+        self._cell.procedure_ended()
         return result
 
     def _go_on(self) -> None:

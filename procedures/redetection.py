@@ -13,8 +13,8 @@ from dualcal_hal.errors import LogMissing, UsageError
 from dualcal_hal.session.captures import CaptureRecord, Captures
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.journal import StepKey
-from dualcal_hal.session.log import Picture, StepBegun, StepFinished, segment_paths
-from dualcal_hal.session.log.attempts import FinishedAttempts
+from dualcal_hal.session.log import Picture, StepBegun, StepFinished
+from dualcal_hal.session.log.attempts import FinishedAttempts, begun_segments
 from dualcal_hal.session.result import Rejected
 from procedures.detection import Detector, Missed
 from procedures.detection.outcome import corners_from_record, corners_to_record
@@ -72,7 +72,7 @@ def _images(session: Session, captures: Captures) -> Iterator[tuple[CaptureRecor
 def _logged(session: Session, wanted: set[str]) -> Iterator[tuple[str, Picture]]:
     """The last picture of each point, which is the one that was captured."""
     try:
-        paths = segment_paths(session.folder)
+        paths = begun_segments(session.folder)
     except LogMissing:
         return
     key: StepKey | None = None

@@ -231,7 +231,7 @@ def test_devices_determine_the_channels(arms):
     layout = Layout(tuple(arms), "camera")
     assert Layout.from_text(layout.to_text()) == layout
     assert Layout.of_topics([channel.topic for channel in layout.channels()]) == layout
-    assert [channel.number for channel in layout.channels()] == list(range(1, 14 + len(arms)))
+    assert [channel.number for channel in layout.channels()] == list(range(1, 15 + len(arms)))
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"arms": 3, "camera": "c"}', '{"arms": [1], "camera": "c"}'])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -135,6 +136,73 @@ def test_a_cell_file_may_name_a_recording(recorded, tmp_path):
     assert json.loads((tmp_path / "new/result.json").read_text()) == json.loads((recorded / "result.json").read_text())
     shutil.rmtree(tmp_path / "old")
     assert "to the last bit" in dualcal("replay", tmp_path / "new").output, "it was recorded in its turn"
+    there, here = (joint_states(folder) for folder in (recorded, tmp_path / "new"))
+    assert {arm: len(states) for arm, states in here.items()} == {arm: len(states) for arm, states in there.items()}
+    assert all(here[arm][-1].positions == states[-1].positions for arm, states in there.items())
+
+
+def joint_states(folder):
+    found = {}
+    with LogReader(folder / "log-0001.mcap") as reader:
+        for item in reader.items(lambda topic: topic.endswith("/joint_states")):
+            found.setdefault(item.arm, []).append(item)
+    return found
+
+
+@pytest.mark.parametrize("size", [0, 8, 300])
+def test_an_attempt_that_left_nothing_does_not_matter(session, size):
+    """As where the disk was full, or the power went, before anything was on the disk."""
+    log = session / "log-0001.mcap"
+    (session / "log-0002.mcap").write_bytes(log.read_bytes()[:size])
+    (session / "log-0003.mcap").write_bytes(log.read_bytes())
+    log.write_bytes(log.read_bytes()[:size])
+    result = dualcal("replay", session)
+    assert result.exit_code == 0, result.output
+    (session / "log-0003.mcap").unlink()
+    assert "its log holds nothing" in dualcal("replay", session).output
+
+
+def test_a_run_that_ended_in_another_way_than_its_replay_is_a_difference(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        lose_the_link(patch, at_move=18)
+        assert dualcal("run", TINY, "--out", tmp_path / "session").exit_code == 1
+
+    def confused(self, frame, *arguments, **options):
+        raise NoPlan("this version does something else")
+
+    monkeypatch.setattr(Detector, "detect", confused)
+    result = dualcal("replay", tmp_path / "session")
+    assert result.exit_code == 1
+    assert "the recorded run ended so: " in result.output
+    assert "the replay so: this version does something else" in result.output
+
+
+def test_a_run_that_was_cut_off_is_replayed_up_to_there(session):
+    """As by a power cut: the log ends in the middle of a step, and the journal before it."""
+    whole = (session / "log-0001.mcap").read_bytes()
+    (session / "log-0001.mcap").write_bytes(whole[: len(whole) * 6 // 10])
+    with LogReader(session / "log-0001.mcap") as reader:
+        finished = {item.key for item in reader.items() if isinstance(item, StepFinished)}
+    journal = (session / "journal.jsonl").read_bytes().splitlines(keepends=True)
+    kept = journal[:1] + [line for line in journal[1:] if StepKey(**json.loads(line)["step"]) in finished]
+    assert 2 < len(kept) < len(journal)
+    (session / "journal.jsonl").write_bytes(b"".join(kept))
+    (session / "result.json").unlink()
+    result = dualcal("replay", session)
+    assert result.exit_code == 0, result.output
+    assert "It ended so: it was cut off" in result.output
+
+
+def test_a_part_of_a_run_without_a_log_cannot_be_replayed(session):
+    """Nor may it seem that the run ended there."""
+    with (session / "journal.jsonl").open("r+") as file:
+        entry = json.loads(file.readlines()[-1])
+        entry["step"]["constraint"] = "verification/99"
+        file.write(json.dumps(entry) + "\n")
+    result = dualcal("replay", session)
+    assert result.exit_code == 1
+    assert "it ends before verification/99" in result.output
+    assert "--no-log" in result.output
 
 
 def test_a_played_back_run_is_begun_anew_rather_than_gone_on_with(recorded, tmp_path):
@@ -158,7 +226,9 @@ def test_a_run_that_failed_is_replayed_up_to_its_failure(tmp_path, monkeypatch):
         assert dualcal("run", TINY, "--out", tmp_path / "session").exit_code == 1
     result = dualcal("replay", tmp_path / "session")
     assert result.exit_code == 0, result.output
-    assert "The recorded run has no result. It ended so: left: move" in result.output or "right: move" in result.output
+    assert re.search(
+        r"The recorded run has no result. It ended so: (left|right): move: no answer; check", result.output
+    )
     assert "Its captures are the same to the last bit." in result.output
 
 
@@ -223,7 +293,7 @@ def test_a_cut_log_and_a_damaged_one_are_told(session):
     log.write_bytes(whole[: len(whole) // 2])
     result = dualcal("replay", session)
     assert result.exit_code == 1
-    assert "the recording ends here" in result.output
+    assert "it was cut off" in result.output
     spoilt = bytearray(whole)
     spoilt[len(whole) // 2] ^= 0xFF
     log.write_bytes(spoilt)
@@ -240,12 +310,12 @@ def test_wherever_a_log_is_cut_the_replay_says_so(session):
         log.write_bytes(whole[: len(whole) * part // 50])
         result = dualcal("replay", session)
         assert result.exit_code in (1, 2), part
-        assert re.search("the recording ends here|log-0001.mcap", result.output), (part, result.output)
+        assert re.search("it ends before|its log holds nothing|left: read: the recording ends here", result.output), (part, result.output)
 
 
 @pytest.mark.parametrize(
     ("content", "code", "said"),
-    [(b"", 1, "the file is empty"), (b"no log at all, but some text", 1, "is no log")],
+    [(b"", 2, "its log holds nothing"), (b"no log at all, but some text", 1, "is no log")],
 )
 def test_a_file_that_is_no_log_is_told(session, content, code, said):
     (session / "log-0001.mcap").write_bytes(content)
@@ -292,10 +362,13 @@ def play(tmp_path):
     def write_and_open(*records, frames=()):
         with LogWriter(tmp_path / "log-0001.mcap", datetime(2026, 5, 4, tzinfo=UTC), arms=("left", "right")) as log:
             for record in records:
-                if isinstance(record, Frame):
-                    log.frame(record)
-                else:
-                    log.record(record)
+                match record:
+                    case Frame():
+                        log.frame(record)
+                    case (arm, state):
+                        log.joint_states(arm, state)
+                    case _:
+                        log.record(record)
         devices = [f"{device}.backend=log" for device in ("robots.left", "robots.right", "camera")]
         cell = load_cell(PAPER, [f"backends.log={{type: replay, session: {tmp_path}}}", *devices])
         backend = ReplayBackend("log", cell)
@@ -365,6 +438,56 @@ def test_after_its_end_a_recording_answers_nothing(play):
 def test_a_call_without_a_reply_is_the_end(play):
     with pytest.raises(LogEnded, match="left"):
         play(Call("left", 0, "read", {}, 0.5)).robot("left").read(1.0)
+
+
+def test_a_recording_that_ends_within_a_motion_says_so(play):
+    """And not that the arm is late."""
+    motion = play(Call("left", 0, "start", {"path": PATH}, 1.0), Reply("left", 0, None, 1.0)).robot("left").start(PATH)
+    with pytest.raises(LogEnded, match="left: move: the recording ends here"):
+        motion.wait(10.0)
+
+
+def test_a_motion_whose_end_is_recorded_ends_so_though_nothing_follows(play):
+    end = MotionEnded("left", 0, MotionState.SETTLED, STATE, 2.0)
+    backend = play(Call("left", 0, "start", {"path": PATH}, 1.0), Reply("left", 0, None, 1.0), end)
+    assert backend.robot("left").start(PATH).wait(10.0).sequence == STATE.sequence
+
+
+@pytest.mark.parametrize(
+    ("rest", "told"),
+    [
+        (Call("left", 4, "start", {"path": PATH}, 3.0), "left: replay: .* 5. call: it is not asked; recorded: start"),
+        (Worked(6, "plan", None, [], 3.0), "procedure: replay: .* 7. work: it is not worked out; recorded: plan"),
+    ],
+)
+def test_what_the_recorded_run_went_on_with_is_missed(play, rest, told):
+    backend = play(Call("left", 3, "read", {}, 0.5), Reply("left", 3, STATE, 0.5), rest)
+    backend.robot("left").read(1.0)
+    with pytest.raises(ReplayMismatch, match=told):
+        backend.procedure_ended()
+
+
+def test_readings_and_stops_are_not_missed(play):
+    backend = play(
+        Call("left", 0, "read", {}, 0.5),
+        Reply("left", 0, STATE, 0.5),
+        Call("left", 1, "stop", {"reason": "the run has ended"}, 0.6),
+        Reply("left", 1, StopResult(True), 0.6),
+    )
+    backend.procedure_ended()
+
+
+def test_who_watches_an_arm_gets_the_states_kept_for_viewers(play):
+    """At their times, which begin with the recording's first, in the order in which they came."""
+    later = replace(STATE, time=5.0, sequence=8)
+    backend = play(("left", STATE), ("left", later), Call("left", 0, "read", {}, 6.0), Reply("left", 0, STATE, 6.0))
+    seen = []
+    backend.robot("left").subscribe(lambda state: seen.append((state, backend.clock.now())))
+    backend.robot("left").read(1.0)
+    assert [(s.positions, s.sequence, s.time, now) for s, now in seen] == [
+        (STATE.positions, 7, pytest.approx(0.0, abs=1e-6), pytest.approx(0.0, abs=1e-6)),
+        (STATE.positions, 8, pytest.approx(3.0, abs=1e-6), pytest.approx(3.0, abs=1e-6)),
+    ]
 
 
 def test_recorded_errors_are_raised_again(play):

@@ -14,7 +14,8 @@ from backends.replay.timeline import RecordedClock, Timeline, ended
 from dualcal_hal.backend import Answer, Backend
 from dualcal_hal.config.fixtures import FOLDER
 from dualcal_hal.errors import WORK, CellFileError, NotOpen, Problem, ReplayMismatch, UnknownDevice, UsageError
-from dualcal_hal.session.log import Worked, segment_paths
+from dualcal_hal.session.log import Call, Worked
+from dualcal_hal.session.log.attempts import begun_segments
 
 if TYPE_CHECKING:
     from dualcal_hal.cellfile import CellFile
@@ -67,7 +68,7 @@ class ReplayBackend(Backend):
     def open(self, timeout: float) -> None:
         if self._timeline is not None:
             raise UsageError(f"{self.name}: open: it is open already; close it first")
-        self._timeline = Timeline(segment_paths(self._session), self._clock)
+        self._timeline = Timeline(begun_segments(self._session), self._clock)
 
     def close(self) -> None:
         timeline, self._timeline = self._timeline, None
@@ -97,6 +98,14 @@ class ReplayBackend(Backend):
             raise ReplayMismatch.at(WORK, work.index, work.asked, asked, f"{what}: {differs}")
         timeline.take_work()
         return Answer(lambda: _result(work), images_are_exact)
+
+    def procedure_ended(self) -> None:
+        """ReplayMismatch for the first command or piece of work that the recorded run went on with."""
+        missing = self._opened(self.name, "end").not_asked()
+        if isinstance(missing, Call):
+            raise ReplayMismatch.at(missing.device, missing.index, missing.method, "nothing more", "it is not asked")
+        if missing is not None:
+            raise ReplayMismatch.at(WORK, missing.index, missing.what, "nothing more", "it is not worked out")
 
     def left(self) -> dict[str, Any]:
         """That something was played back."""

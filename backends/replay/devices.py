@@ -38,11 +38,13 @@ class ReplayedRobot(Robot):
         return _expect(reply, RobotState)
 
     def subscribe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
-        """What arrived by the recorded subscription; nothing where none was recorded, which is no command."""
+        """What arrived by the recorded subscription; where none was, which is no command, the states for viewers."""
         timeline = self._opened(self.name, "subscribe")
+        unwatch = timeline.watch(self.name, function)  # before the recording is read any further
         recorded = timeline.next_call(self.name)
         if recorded is None or recorded.call.method != "subscribe":
-            return lambda: None
+            return unwatch
+        unwatch()
         call, _ = _answer(timeline, self.name, "subscribe")
         return timeline.subscribe(self.name, call.index, function)
 

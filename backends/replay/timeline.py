@@ -6,12 +6,13 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from dualcal_hal.camera import Frame
 from dualcal_hal.clock import VirtualClock
-from dualcal_hal.errors import WORK, FrameMissing, LogEnded
-from dualcal_hal.robot import Motion, RobotState
+from dualcal_hal.errors import WORK, FrameMissing, LogDamaged, LogEnded
+from dualcal_hal.robot import Mode, Motion, MotionState, RobotState
 from dualcal_hal.session.log import (
     Arrived,
     Call,
@@ -26,7 +27,12 @@ from dualcal_hal.session.log import (
 )
 from dualcal_hal.session.log.attempts import FinishedAttempts
 
+_COMMANDS = frozenset({"start", "grab", "enable", "disable", "reset_fault"})
+"""Calls that make something happen; a stop may always be one more or less, and a reading harms nobody."""
+
 _SEQUENCES = 1 << 32
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_MICROSECOND = timedelta(microseconds=1)
 
 
 class RecordedClock(VirtualClock):
@@ -64,14 +70,19 @@ class Timeline:
     def __init__(self, paths: list[Path], clock: RecordedClock) -> None:
         """Reads the files once; LogMissing, LogDamaged or LogTooNew."""
         self._clock = clock
-        self._exact = [_frames_of(path) == "png" for path in paths]
-        self._items = _in_one_time(FinishedAttempts(paths).items(), clock.now())
+        about = [_About.of(path) for path in paths]
+        self._exact = [each.exact for each in about]
+        self._watchers: dict[str, Callable[[RobotState], None]] = {}
+        items = FinishedAttempts(paths).items(self._watchers.__contains__)
+        self._items = _in_one_time(items, about, clock.now())
         self._lock = threading.RLock()
         self._calls: dict[str, deque[Call]] = {}
         self._replies: dict[tuple[str, int], Reply] = {}
         self._pictures: dict[tuple[str, int], Picture] = {}
         self._works: deque[tuple[Worked, bool]] = deque()
         self._motions: dict[tuple[str, int], Motion] = {}
+        self._ending: set[tuple[str, int]] = set()
+        """Motions of which it is known when they end."""
         self._ends: dict[tuple[str, int], MotionEnded] = {}
         self._subscribers: dict[tuple[str, int], Callable[[RobotState], None]] = {}
         self._next: tuple[float, int, Item] | None = None
@@ -85,6 +96,7 @@ class Timeline:
             self._next = None
             motions, self._motions = list(self._motions.values()), {}
             self._subscribers.clear()
+            self._watchers.clear()
         for motion in motions:
             motion.stop("the recording was closed")
 
@@ -143,6 +155,27 @@ class Timeline:
             self._subscribers[device, index] = function
         return lambda: self._unsubscribe(device, index)
 
+    def watch(self, device: str, function: Callable[[RobotState], None]) -> Callable[[], None]:
+        """Hand over the joint states that were kept for viewers; returns what ends that.
+
+        They do not say in which mode the arm was.
+        """
+        with self._lock:
+            self._watchers[device] = function
+        return lambda: self._unwatch(device)
+
+    def not_asked(self) -> Call | Worked | None:
+        """The first command or piece of work in the rest of the recording that nobody has asked for."""
+        while self._play_next(None) is not None:
+            pass
+        with self._lock:
+            calls = (call for calls in self._calls.values() for call in calls)
+            rest: list[Call | Worked] = [
+                call for call in calls if call.method in _COMMANDS and not self._was_closed(call)
+            ]
+            rest += [work for work, _ in self._works]
+        return min(rest, key=lambda each: each.time, default=None)
+
     def frame(self, reference: FrameRef) -> Frame:
         """The frame that a reply speaks of; FrameMissing, LogDamaged."""
         with self._lock:
@@ -160,16 +193,19 @@ class Timeline:
         with self._lock:
             if self._next is None:
                 self._next = next(self._items, None)
-            if self._next is None:
-                return None
-            when, file, item = self._next
-            if until is not None and when > until:
-                return None
-            self._next = None
-            self._happen(item, file)
-            return when
+            if self._next is not None:
+                when, file, item = self._next
+                if until is not None and when > until:
+                    return None
+                self._next = None
+                self._happen(item, file, when)
+                return when
+            endless = [self._motions.pop(key) for key in self._motions.keys() - self._ending]
+        for motion in endless:
+            motion.end(MotionState.FAILED, None, ended(motion.device, "move"))
+        return None
 
-    def _happen(self, item: Item, file: int) -> None:
+    def _happen(self, item: Item, file: int, when: float) -> None:
         match item:
             case Call(device):
                 self._calls.setdefault(device, deque()).append(item)
@@ -188,6 +224,9 @@ class Timeline:
                     self._ends[device, index] = item
             case Arrived(device, index, _, time):
                 self._clock.call_at(time, lambda: self._hand_over(device, index, item.state))
+            case JointReading(arm, sequence, positions, velocities):
+                state = RobotState(positions, velocities, Mode.UNKNOWN, (), when, sequence)
+                self._clock.call_at(when, lambda: self._show(arm, state))
 
     def _is_awaited(self, picture: tuple[str, int]) -> bool:
         frames = (reply.value for reply in self._replies.values())
@@ -197,9 +236,12 @@ class Timeline:
         def end() -> None:
             with self._lock:
                 motion = self._motions.pop((ended.device, ended.index), None)
+                self._ending.discard((ended.device, ended.index))
             if motion is not None:
                 motion.end(ended.state, ended.final, None if ended.error is None else ended.error.error())
 
+        with self._lock:
+            self._ending.add((ended.device, ended.index))
         self._clock.call_at(ended.time, end)
 
     def _hand_over(self, device: str, index: int, state: RobotState) -> None:
@@ -207,6 +249,20 @@ class Timeline:
             function = self._subscribers.get((device, index))
         if function is not None:
             function(state)
+
+    def _show(self, arm: str, state: RobotState) -> None:
+        with self._lock:
+            function = self._watchers.get(arm)
+        if function is not None:
+            function(state)
+
+    def _unwatch(self, device: str) -> None:
+        with self._lock:
+            self._watchers.pop(device, None)
+
+    def _was_closed(self, call: Call) -> bool:
+        reply = self._replies.get((call.device, call.index))
+        return reply is not None and _found_it_closed(reply)
 
     def _unsubscribe(self, device: str, index: int) -> None:
         with self._lock:
@@ -216,14 +272,32 @@ class Timeline:
 def ended(device: str, attempted: str) -> LogEnded:
     """Nothing more is recorded of the device."""
     what = "worked out" if device == WORK else "asked of it"
-    return LogEnded(
-        device, attempted, f"the recording ends here: nothing more was {what}", "the recorded run had ended"
-    )
+    why = f"the recording ends here: nothing more was {what}"
+    return LogEnded(device, attempted, why, "the recorded run had ended, or was cut off")
 
 
-def _frames_of(path: Path) -> str:
-    with LogReader(path) as reader:
-        return reader.about().get("frames", "")
+@dataclass(frozen=True)
+class _About:
+    """What a file says of itself. started: ns since 1970 (UTC), when its clock showed clock_started (s)."""
+
+    exact: bool
+    started: int
+    clock_started: float
+
+    @staticmethod
+    def of(path: Path) -> _About:
+        with LogReader(path) as reader:
+            about = reader.about()
+        try:
+            since = datetime.fromisoformat(about["started"]) - _EPOCH
+            clock_started = float(about["clock_started_s"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise LogDamaged(str(path), None, "does not say when it was begun") from error
+        return _About(about.get("frames") == "png", since // _MICROSECOND * 1000, clock_started)
+
+    def clock(self, when: int) -> float:
+        """Seconds of the file's clock at a time in ns since 1970."""
+        return self.clock_started + (when - self.started) * 1e-9
 
 
 def _found_it_closed(reply: Reply) -> bool:
@@ -231,16 +305,19 @@ def _found_it_closed(reply: Reply) -> bool:
     return reply.error is not None and reply.error.name == "NotOpen"
 
 
-def _in_one_time(items: Iterator[tuple[int, Item]], start: float) -> Generator[tuple[float, int, Item]]:
+def _in_one_time(
+    items: Iterator[tuple[int, Item]], about: list[_About], start: float
+) -> Generator[tuple[float, int, Item]]:
     """Items with their time, which never goes back: each file goes on from where the one before it ended."""
     newest, shift, current = start, 0.0, -1
     for file, item in items:
-        if isinstance(item, JointReading | Picture):
+        if isinstance(item, Picture):
             yield newest, file, item
             continue
+        time = about[file].clock(item.when) if isinstance(item, JointReading) else item.time
         if file != current:
-            current, shift = file, newest - item.time
-        newest = max(newest, item.time + shift)
+            current, shift = file, newest - time
+        newest = max(newest, time + shift)
         yield newest, file, _shifted(item, shift) if shift else item
 
 

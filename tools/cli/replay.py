@@ -16,11 +16,22 @@ from rich.console import Console
 from dualcal_hal.camera import Image
 from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import CellFile, load_cell
-from dualcal_hal.errors import DualcalError, FrameMissing, Interrupted, LogDamaged, ReplayMismatch, UsageError
+from dualcal_hal.errors import (
+    DualcalError,
+    FrameMissing,
+    Interrupted,
+    LogDamaged,
+    LogEnded,
+    MotionStopped,
+    ReplayMismatch,
+    UsageError,
+)
 from dualcal_hal.session.comparison import Comparison, compare_captures, compare_results
 from dualcal_hal.session.folder import Session
-from dualcal_hal.session.journal import Journal
-from dualcal_hal.session.log import segment_paths
+from dualcal_hal.session.journal import Journal, StepKey
+from dualcal_hal.session.log import LogReader
+from dualcal_hal.session.log.attempts import FinishedAttempts, begun_segments
+from dualcal_hal.session.log.records import RecordedError
 from dualcal_hal.session.result import Result, read_result
 from procedures.calibrate import Calibration, captures_of
 from procedures.planning.model import CellModel
@@ -42,13 +53,15 @@ class ReplayOptions:
 
 @dataclass(frozen=True)
 class Replayed:
-    """result: None if the recorded run has none; ended: how that run ended then; times in s.
+    """result: None if the recorded run has none; ended: how that run ended then, and ``otherwise`` if the replay ended
+    in another way; times in s.
 
     served: whether detections were not worked out anew, because images were recorded with loss.
     """
 
     result: Result | None
     ended: str
+    otherwise: str
     recorded_time: float
     time: float
     served: bool
@@ -57,11 +70,13 @@ class Replayed:
 
     @property
     def identical(self) -> bool:
-        return self.captures.identical and (self.results is None or self.results.identical)
+        same_result = self.results is None or self.results.identical
+        return self.captures.identical and same_result and not self.otherwise
 
     @property
     def differences(self) -> tuple[str, ...]:
-        return (*self.captures.differences, *(self.results.differences if self.results else ()))
+        ends = (self.otherwise,) if self.otherwise else ()
+        return (*self.captures.differences, *(self.results.differences if self.results else ()), *ends)
 
 
 def replay_session(options: ReplayOptions) -> int:
@@ -82,7 +97,7 @@ def _load(session: Path) -> CellFile:
     path = session / "cell.yaml"
     if not path.is_file():
         raise UsageError(f"{session}: is no session: there is no cell.yaml in it")
-    segment_paths(session)  # refused now, before anything is begun
+    begun_segments(session)  # refused now, before anything is begun
     cell = load_cell(path).cell
     name = "replay"
     while name in cell.backends:
@@ -110,9 +125,12 @@ def _session(out: Path | None, cell_text: str) -> Iterator[Session]:
 
 def _replay(recorded: Path, file: CellFile, session: Session) -> Replayed:
     expected = read_result(recorded / "result.json") if (recorded / "result.json").exists() else None
+    segments = begun_segments(recorded)
+    log, journal = FinishedAttempts(segments), Journal(recorded / "journal.jsonl")
+    _require_all_steps(recorded, log, journal)
     cell, calibration = Cell(file), Calibration(file.cell, CellModel(file.cell))
     begun = perf_counter()
-    result, ended = None, ""
+    result, error = None, None
     try:
         with signals_deferred() as signals:
             execute(cell, calibration, session, lambda event: None, lambda engine: signals.pass_on_to(engine.abort))
@@ -122,21 +140,58 @@ def _replay(recorded: Path, file: CellFile, session: Session) -> Replayed:
         result = read_result(session.result_path)
     except _NO_END_OF_A_RUN:
         raise
-    except DualcalError as error:
+    except DualcalError as raised:
         if expected is not None:
             raise
-        ended = str(error)
+        error = raised
     taken = captures_of(session.journal, file.sha256, None).captures
-    there = captures_of(Journal(recorded / "journal.jsonl"), file.sha256, None).captures
+    there = captures_of(journal, file.sha256, None).captures
+    ended, otherwise = ("", "") if expected is not None else _compare_ends(log, error)
     return Replayed(
         result,
         ended,
+        otherwise,
         cell.clock.now(),
         perf_counter() - begun,
-        file.cell.session.frames != "png",
+        not all(map(_is_exact, segments)),
         compare_captures(there, taken),
         None if expected is None or result is None else compare_results(expected, result),
     )
+
+
+def _require_all_steps(recorded: Path, log: FinishedAttempts, journal: Journal) -> None:
+    """LogDamaged for steps that no log has, whether it was cut off or never kept."""
+    missing = [_name(key) for key, _ in journal.results() if key not in log.finished]
+    if missing:
+        steps = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
+        why = f"it ends before {steps}: it was cut off, or that part ran with --no-log; dualcal estimate still works"
+        raise LogDamaged(f"the log of {recorded}", None, why)
+
+
+def _name(step: StepKey) -> str:
+    place = step.constraint or step.phase
+    return place if step.position is None else f"{place} position {step.position}"
+
+
+def _compare_ends(log: FinishedAttempts, error: DualcalError | None) -> tuple[str, str]:
+    """How a run without a result ended, and in words if its replay ended in another way."""
+    if log.ended is None:
+        ended, same = "it was cut off", isinstance(error, LogEnded)
+    elif log.ended.error is None:
+        ended, same = "well, before it was analysed", error is None
+    else:
+        recorded = log.ended.error.error()
+        ended = str(recorded)
+        if isinstance(recorded, Interrupted):  # from outside, in the middle of whatever was done
+            same = isinstance(error, MotionStopped | LogEnded)
+        else:
+            same = error is not None and RecordedError.of(error) == log.ended.error
+    return ended, "" if same else f"the recorded run ended so: {ended}; the replay so: {error or 'well'}"
+
+
+def _is_exact(segment: Path) -> bool:
+    with LogReader(segment) as reader:
+        return reader.about().get("frames") == "png"
 
 
 def _document(replayed: Replayed) -> dict[str, object]:
@@ -158,7 +213,7 @@ def _show(console: Console, replayed: Replayed) -> None:
     faster = replayed.recorded_time / replayed.time
     say(f"{replayed.recorded_time:.0f} s of recorded time in {replayed.time:.1f} s, {faster:.0f} times as fast")
     if replayed.results is None:
-        say(f"The recorded run has no result. It ended so: {replayed.ended or 'before it was analysed'}")
+        say(f"The recorded run has no result. It ended so: {replayed.ended}")
     if replayed.served:
         say("The images were recorded with loss: the recorded detections were taken in place of new ones.")
     what = "captures" if replayed.results is None else "result"

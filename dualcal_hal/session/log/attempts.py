@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from dualcal_hal.errors import LogMissing
 from dualcal_hal.session.journal import StepKey
+from dualcal_hal.session.log.framing import Opcode
 from dualcal_hal.session.log.layout import RECORD_TOPICS, arm_of
-from dualcal_hal.session.log.reader import Item, LogReader
-from dualcal_hal.session.log.records import StepBegun, StepFinished
+from dualcal_hal.session.log.reader import Item, LogReader, begins, segment_paths
+from dualcal_hal.session.log.records import RunEnded, StepBegun, StepFinished
 
-_STEPS = {RECORD_TOPICS[StepBegun], RECORD_TOPICS[StepFinished]}
+_MARKS = {RECORD_TOPICS[kind] for kind in (StepBegun, StepFinished, RunEnded)}
+
+
+def begun_segments(path: Path) -> list[Path]:
+    """The files of a session's log, or the file itself, without those of attempts that ended before anything of them
+    was on the disk; LogMissing if none is left."""
+    paths = segment_paths(path)
+    begun = [each for each in paths if _has_begun(each)]
+    if not begun:
+        names = ", ".join(each.name for each in paths)
+        raise LogMissing(f"{path}: its log holds nothing ({names}): the run ended before its first step")
+    return begun
+
+
+def _has_begun(path: Path) -> bool:
+    if not begins(path):
+        return False
+    with LogReader(path) as reader:
+        return any(piece.opcode in (Opcode.CHUNK, Opcode.DATA_END) for piece in reader.pieces())
 
 
 @dataclass(frozen=True)
@@ -26,29 +46,46 @@ class FinishedAttempts:
     """What happened in the files of a session's log, in order.
 
     Of a step's attempts the last finished one is kept, and in the last file also what no step finished: there the run
-    ended. What happened outside of steps counts in the last file alone. Joint states, which are for viewers, are left
-    out.
+    ended. What happened outside of steps counts in the last file alone.
+
+    finished: the steps that are. ended: how the run ended; None if it was cut off.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
         """Reads the files once; LogDamaged."""
         self._paths = paths
         self._finished: dict[StepKey, _Attempt] = {}
+        self.ended: RunEnded | None = None
         for number, path in enumerate(paths):
             steps = _Steps(number)
+            self.ended = None
             with LogReader(path) as reader:
-                for item in reader.items(_STEPS.__contains__):
+                for item in reader.items(_MARKS.__contains__):
+                    if isinstance(item, RunEnded):
+                        self.ended = item
                     finished = steps.follow(item)
                     if finished is not None:
                         self._finished[finished[0]] = finished[1]
 
-    def items(self) -> Iterator[tuple[int, Item]]:
-        """Items with the number of their file, from 0."""
+    @property
+    def finished(self) -> frozenset[StepKey]:
+        return frozenset(self._finished)
+
+    def items(self, wants_states_of: Callable[[str], bool] = lambda arm: False) -> Iterator[tuple[int, Item]]:
+        """Items with the number of their file, from 0; with the joint states, for viewers, of the arms asked for.
+
+        It is asked anew for each of these.
+        """
+
+        def wanted(topic: str) -> bool:
+            arm = arm_of(topic)
+            return arm is None or wants_states_of(arm)
+
         for number, path in enumerate(self._paths):
             is_last = number == len(self._paths) - 1
             steps = _Steps(number)
             with LogReader(path) as reader:
-                for item in reader.items(lambda topic: arm_of(topic) is None):
+                for item in reader.items(wanted):
                     current = steps.current
                     finished = steps.follow(item)
                     step = finished or steps.current or current

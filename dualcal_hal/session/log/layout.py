@@ -14,6 +14,7 @@ from dualcal_hal.session.log.records import (
     Note,
     Record,
     Reply,
+    RunEnded,
     StepBegun,
     StepFinished,
     Worked,
@@ -39,6 +40,7 @@ RECORD_TOPICS: dict[type[Record], str] = {
     StepFinished: "/dualcal/steps/finished",
     Worked: "/dualcal/work",
     Note: "/dualcal/notes",
+    RunEnded: "/dualcal/end",
 }
 RECORD_KINDS = {topic: kind for kind, topic in RECORD_TOPICS.items()}
 

@@ -266,6 +266,13 @@ class LogReader:
             )
 
 
+def begins(path: Path) -> bool:
+    """Whether the file is longer than what a log begins with; LogMissing if it cannot be read."""
+    with _open(path) as file:
+        magic = file.read(len(MAGIC) + 1)
+    return len(magic) > len(MAGIC) or not MAGIC.startswith(magic)
+
+
 class SessionLog:
     """The log of a session's folder: its files ``log-0001.mcap``, ``log-0002.mcap`` and so on, one for each attempt."""
 

@@ -28,6 +28,7 @@ from dualcal_hal.session.log.records import (
     Record,
     RecordedError,
     Reply,
+    RunEnded,
     StepBegun,
     StepFinished,
     Value,
@@ -124,6 +125,7 @@ class LogRecording(Recording):
         except BaseException:
             with suppress(LogNotWritten):  # the first failure is the one to tell
                 self._log.close()
+            path.unlink(missing_ok=True)  # nothing of the run is in it
             raise
 
     def __exit__(
@@ -131,10 +133,12 @@ class LogRecording(Recording):
     ) -> None:
         self.leave()
         if error is None:
+            self.record(RunEnded(None, self.now()))
             self._log.close()
             return
         try:
             self.note(f"{type(error).__name__}: {error}", "error")
+            self.record(RunEnded(RecordedError.of(error), self.now()))
             self._log.close()
         except LogNotWritten as second:
             if second is not error:
@@ -200,20 +204,22 @@ class LogRecording(Recording):
         """Seconds of the clock."""
         return self._clock.now()
 
-    def record(self, record: Record) -> None:
-        """Any record; LogNotWritten."""
-        self._log.record(record)
+    def record(self, record: Record, *, wait: bool = True) -> None:
+        """Any record; LogNotWritten. With arms that may be moving there is no waiting for the disk."""
+        self._log.record(record, wait=wait)
 
     def frame(self, frame: Frame) -> None:
         """A camera's frame, before the reply that refers to it."""
         self._log.frame(frame)
 
-    def call(self, device: str, method: str, arguments: Mapping[str, Value], time: float) -> int:
-        """Record a call; its index."""
-        with self._lock:
+    def call(self, device: str, method: str, arguments: Mapping[str, Value], time: float, *, wait: bool = True) -> int:
+        """Record a call; its index. Here, before anything is sent, a run waits for a disk that is behind."""
+        if wait:
+            self._log.await_room()
+        with self._lock:  # held for no longer than it takes to queue, as stops need it too
             index = self._calls.get(device, 0)
             self._calls[device] = index + 1
-            self.record(Call(device, index, method, arguments, time))
+            self.record(Call(device, index, method, arguments, time), wait=False)
         return index
 
     def _tell_slow(self, seconds: float) -> None:
@@ -238,7 +244,8 @@ class _RecordedRobot(Robot):
         index = recording.call(name, "subscribe", {}, recording.now())
 
         def arrived(state: RobotState) -> None:
-            recording.record(Arrived(name, index, state, recording.now()))
+            with suppress(LogNotWritten):  # told by the next command; the device's thread is not the place
+                recording.record(Arrived(name, index, state, recording.now()), wait=False)
             function(state)
 
         return _answered(recording, name, index, lambda: self._robot.subscribe(arrived), lambda _: None)
@@ -251,13 +258,14 @@ class _RecordedRobot(Robot):
         def ended() -> None:
             error = None if motion.error is None else RecordedError.of(motion.error)
             with suppress(LogNotWritten):  # told by the next command; the device's thread is not the place
-                recording.record(MotionEnded(name, index, motion.state, motion.final, recording.now(), error))
+                ended = MotionEnded(name, index, motion.state, motion.final, recording.now(), error)
+                recording.record(ended, wait=False)
 
         motion.on_end(ended)
         return motion
 
     def stop(self, reason: str) -> StopResult:
-        """Sent first and recorded afterwards: no disk delays or prevents it."""
+        """Sent first and recorded afterwards, without waiting: no disk delays or prevents it, or the next."""
         recording, asked = self._recording, self._recording.now()
         error: BaseException | None = None
         result: StopResult | None = None
@@ -269,9 +277,9 @@ class _RecordedRobot(Robot):
             raise
         finally:
             with suppress(LogNotWritten):  # told by the next command; the stop itself is done
-                index = recording.call(self.name, "stop", {"reason": reason}, asked)
+                index = recording.call(self.name, "stop", {"reason": reason}, asked, wait=False)
                 failure = None if error is None else RecordedError.of(error)
-                recording.record(Reply(self.name, index, result, recording.now(), failure))
+                recording.record(Reply(self.name, index, result, recording.now(), failure), wait=False)
 
     def enable(self, timeout: float) -> None:
         self._switch("enable", timeout, self._robot.enable)
@@ -322,11 +330,11 @@ def _answered(
         value = function()
     except Exception as error:
         try:
-            recording.record(Reply(device, index, None, recording.now(), RecordedError.of(error)))
+            recording.record(Reply(device, index, None, recording.now(), RecordedError.of(error)), wait=False)
         except LogNotWritten as second:
             error.add_note(str(second))
         raise
-    recording.record(Reply(device, index, written(value), recording.now()))
+    recording.record(Reply(device, index, written(value), recording.now()), wait=False)
     return value
 
 

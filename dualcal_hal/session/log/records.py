@@ -141,7 +141,15 @@ class Note:
     time: float
 
 
-Record = Call | Reply | MotionEnded | Arrived | StepBegun | StepFinished | Worked | Note
+@dataclass(frozen=True)
+class RunEnded:
+    """The run, or this part of it, has come to its end; a file without this was cut off. None: to its good end."""
+
+    error: RecordedError | None
+    time: float
+
+
+Record = Call | Reply | MotionEnded | Arrived | StepBegun | StepFinished | Worked | Note | RunEnded
 
 
 def to_json(record: Record) -> bytes:
@@ -581,5 +589,10 @@ _FORMS: dict[type[Any], _Form] = {
         lambda r: {"level": r.level, "text": r.text, "time_s": _number(r.time)},
         lambda f: Note(_read_level(f), f.text("text"), f.number("time_s")),
         {"level": {"enum": list(_LEVELS)}, "text": _TEXT, "time_s": _NUMBER},
+    ),
+    RunEnded: _Form(
+        lambda r: {"error": _error(r.error), "time_s": _number(r.time)},
+        lambda f: RunEnded(_read_error(f.part_or_none("error")), f.number("time_s")),
+        {"error": _ERROR, "time_s": _NUMBER},
     ),
 }

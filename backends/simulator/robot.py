@@ -14,7 +14,7 @@ from dualcal_hal.robot import JointPath, Mode, Motion, Robot, RobotState, StopRe
 if TYPE_CHECKING:
     from dualcal_hal.config import RobotConfig
 
-STATE_PERIOD = 0.02  # s of simulated time between subscribed states
+STATE_PERIOD = 0.05  # s of simulated time between subscribed states: what a viewer needs, at half the cost of 50 Hz
 _ROUNDING = 1e-6  # rad by which a waypoint may exceed a limit
 
 
@@ -38,7 +38,7 @@ class SimulatedRobot(Robot):
         return self._world("read").arms[self.name].state("read")
 
     def subscribe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
-        """States every 0.02 s of simulated time, in the thread that makes the time; nothing is queued.
+        """States every 0.05 s of simulated time, in the thread that makes the time; nothing is queued.
 
         If ``function`` raises, its subscription ends and whoever made the time, by waiting on the clock,
         gets a DeviceError.

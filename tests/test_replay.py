@@ -310,7 +310,10 @@ def test_wherever_a_log_is_cut_the_replay_says_so(session):
         log.write_bytes(whole[: len(whole) * part // 50])
         result = dualcal("replay", session)
         assert result.exit_code in (1, 2), part
-        assert re.search("it ends before|its log holds nothing|left: read: the recording ends here", result.output), (part, result.output)
+        assert re.search("it ends before|its log holds nothing|left: read: the recording ends here", result.output), (
+            part,
+            result.output,
+        )
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,13 @@ from dualcal_hal.transforms import Array
 LARGEST_BACKLOG = 1 << 26
 """Bytes that may wait to be written; then whoever brings more waits."""
 
+WORTH_WAKING = 1 << 16
+"""Bytes that wait from which on the thread writes them at once: to wake it for each record costs a run more than the
+writing does."""
+
+LONGEST_REST = 0.1
+"""Seconds after which it writes what there is."""
+
 SLOW = 0.1
 """Seconds of one wait from which on it is told that the log slows the run."""
 
@@ -137,6 +144,7 @@ class LogWriter:
         self._told: float | None = None
         self._jobs: deque[_Job] = deque()
         self._waiting = 0
+        self._due = False
         self._change = threading.Condition()
         self._failure: BaseException | None = None
         self._failure_told = False
@@ -178,7 +186,7 @@ class LogWriter:
         """Return when what waits to be written is less than the backlog's bound."""
         begun = time.perf_counter()
         with self._change:
-            self._change.wait_for(lambda: self._has_room(0))
+            self._wait_for_room(0)
         self._raise_failure()
         self._tell_if_slow(time.perf_counter() - begun)
 
@@ -246,6 +254,7 @@ class LogWriter:
 
         self._put(_Job(write, 0))
         with self._change:
+            self._wake()
             self._change.wait_for(lambda: done.is_set() or self._failure is not None)
         self._raise_failure()
 
@@ -278,15 +287,27 @@ class LogWriter:
         begun = time.perf_counter()
         with self._change:
             if wait:
-                self._change.wait_for(lambda: self._has_room(job.size))
+                self._wait_for_room(job.size)
             if self._failure is None:
                 if self._closing:
                     raise LogNotWritten(f"{self.path}: the log is closed")
                 self._jobs.append(job)
                 self._waiting += job.size
-                self._change.notify_all()
+                if self._waiting >= WORTH_WAKING:
+                    self._wake()
         self._raise_failure()
         self._tell_if_slow(time.perf_counter() - begun)
+
+    def _wait_for_room(self, size: int) -> None:
+        if not self._has_room(size):
+            self._wake()
+            self._change.wait_for(lambda: self._has_room(size))
+
+    def _wake(self) -> None:
+        """Have the thread write what there is."""
+        if not self._due:
+            self._due = True
+            self._change.notify_all()
 
     def _has_room(self, size: int) -> bool:
         if self._failure is not None or self._closing:
@@ -319,18 +340,25 @@ class LogWriter:
     def _serve(self) -> None:
         failure: BaseException | None = None
         try:
-            while (job := self._next()) is not None:
-                job.run()
-                self._finished(job)
+            while jobs := self._next():
+                for job in jobs:
+                    job.run()
+                    self._finished(job)
             self._writer.finish()
         except BaseException as error:  # noqa: BLE001 - told to the next caller; a thread that died silently would hang it
             failure = error
         self._release(failure)
 
-    def _next(self) -> _Job | None:
+    def _next(self) -> list[_Job]:
+        """All that waits, in its order; nothing once it is over."""
         with self._change:
-            self._change.wait_for(lambda: self._jobs or self._closing)
-            return self._jobs.popleft() if self._jobs else None
+            while True:
+                self._change.wait_for(lambda: self._due or self._closing, LONGEST_REST)
+                self._due = False
+                if self._jobs or self._closing:
+                    jobs = list(self._jobs)
+                    self._jobs.clear()
+                    return jobs
 
     def _finished(self, job: _Job) -> None:
         with self._change:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualcal_hal.clock import Clock
-from dualcal_hal.errors import CommandRefused
+from dualcal_hal.errors import CommandRefused, DeviceError
 from dualcal_hal.geometry import BETWEEN_SAMPLES, CellGeometry, Placement
 from dualcal_hal.robot import JointPath, Mode, Motion, MotionState, Robot, RobotState, StopResult
 from dualcal_hal.transforms import Array
@@ -35,6 +35,7 @@ So a plan that kept the whole of it, for the same placement, is not refused.
 READING_SLACK = 0.001
 """m by which clearance may seem to fall because joints are read, not known."""
 
+_ENCODERS = "check the link and the encoders"
 _LIMIT_TOLERANCE = 1e-6  # rad, for what rounding does at a limit
 
 
@@ -158,7 +159,11 @@ class GuardedRobot(Robot):
         return self._robot.joints
 
     def read(self, timeout: float) -> RobotState:
-        return self._robot.read(timeout)
+        """The arm's state; DeviceError if it is none of an arm with these joints."""
+        state = self._robot.read(timeout)
+        if (why := self._unusable(state)) is not None:
+            raise DeviceError(self.name, "read", why, _ENCODERS)
+        return state
 
     def subscribe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
         return self._robot.subscribe(function)
@@ -198,11 +203,15 @@ class GuardedRobot(Robot):
         age = self._clock.now() - state.time
         if not -CLOCK_SLACK <= age <= OLDEST_FEEDBACK:
             raise CommandRefused(self.name, attempted, f"its state is {age:.2f} s old", "check the link to the arm")
+        if (why := self._unusable(state)) is not None:
+            raise CommandRefused(self.name, attempted, why, _ENCODERS)
+        return state
+
+    def _unusable(self, state: RobotState) -> str | None:
         for what, values in (("positions", state.positions), ("velocities", state.velocities)):
             if len(values) != len(self._limits.lower) or not np.all(np.isfinite(values)):
-                why = f"its {what} are not {len(self._limits.lower)} finite numbers: {values}"
-                raise CommandRefused(self.name, attempted, why, "check the link and the encoders")
-        return state
+                return f"its {what} are not {len(self._limits.lower)} finite numbers: {values}"
+        return None
 
     def _check_values(self, path: JointPath) -> None:
         limits = self._limits

@@ -15,8 +15,9 @@ import numpy as np
 from dualcal_hal.config import CellConfig, ProcedureConfig
 from dualcal_hal.errors import NoPlan
 from dualcal_hal.robot import Joints
-from dualcal_hal.session.captures import CaptureRecord, Captures
+from dualcal_hal.session.captures import CaptureRecord, Captures, CellShape
 from dualcal_hal.session.journal import Journal, StepKey
+from dualcal_hal.session.plain import Fields, expect, finites
 from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Rejected
 from dualcal_hal.transforms import Array
 from procedures.alignment import (
@@ -60,6 +61,8 @@ NO_WAY_TO_LOOK = "no clear way leads there"
 _WHAT_TO_CHECK = (
     "check square_mm, target_mount, the camera's matrix, the nominal transforms, and order, sign and zero of the joints"
 )
+_WORST_CONDITION = 1e6
+"""Of a recorded Jacobian: beyond, no shift can be worked out by it."""
 _REPLACEMENTS = 3
 """Constraints that may be given up, for each that is wanted."""
 
@@ -90,7 +93,8 @@ class LookRecord:
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
-        return cls(_view_from(record["view"]), record["reason"])
+        fields = Fields(record, "the look")
+        return cls(_view_from(fields.any("view")), fields.text("reason"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,16 +129,17 @@ class PointRecord:
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
-        capture, servo, offset = record["capture"], record["servo"], record["offset_px"]
+        fields = Fields(record, "the point")
+        offset = None if fields.is_null("offset_px") else fields.finites("offset_px", 2)
         return cls(
-            record["outcome"],
-            record["frames"],
-            record["reason"],
+            fields.choice("outcome", list(Outcome)),
+            fields.whole("frames"),
+            fields.text("reason"),
             None if offset is None else (offset[0], offset[1]),
-            _view_from(record["view"]),
-            None if capture is None else CaptureRecord.from_record(capture),
-            None if servo is None else Servo(np.array(record.get("servo_first") or servo), np.array(servo)),
-            tuple(np.array(offset) for offset in record["arrivals_px"]),
+            _view_from(fields.any("view")),
+            None if fields.is_null("capture") else CaptureRecord.from_record(fields.part("capture").content),
+            None if fields.is_null("servo") else _servo_from(fields),
+            tuple(np.array(finites(arrival, "arrivals_px", 2)) for arrival in fields.items("arrivals_px")),
         )
 
 
@@ -144,6 +149,7 @@ class Calibration:
     def __init__(self, cell: CellConfig, model: CellModel) -> None:
         self._procedure = cell.procedure
         self._model = model
+        self._shape = CellShape.of(cell)
         self._detector = Detector(model.board, model.intrinsics.size)
         self._arrivals_px: list[Array] = []
         require_visible(model)
@@ -159,7 +165,9 @@ class Calibration:
         if self._procedure.first_looks:
             yield from self._first_look()
         wanted = requests_of(self._procedure)
-        planned = yield from task(StepKey("plan", None, None, "plan"), lambda: self._select(wanted, "plan"), Plan)
+        planned = yield from task(
+            StepKey("plan", None, None, "plan"), lambda: self._select(wanted, "plan"), self._plan_from
+        )
         yield from self._adopt_plan(planned)
         for request in wanted:
             yield from self._constraints(request, list(planned.of(request.use)))
@@ -168,14 +176,14 @@ class Calibration:
     # -- first look ---------------------------------------------------------------------------------------------
 
     def _first_look(self) -> Procedure[None]:
-        stand_off = yield from task(StepKey("looks", None, None, "stand-off"), self._stand_off, StandOffRecord)
+        stand_off = yield from task(StepKey("looks", None, None, "stand-off"), self._stand_off, self._stand_off_from)
         self._retreats.insert(0, stand_off.posture)
         yield from self._adopt(self._belief)
         count = self._procedure.first_looks
         reasons = []
         for number in range(count):
             key = StepKey("looks", f"looks/{number}", None, "look")
-            record = yield from task(key, lambda n=number: self._look(stand_off.posture, n), LookRecord)  # type: ignore[misc]
+            record = yield from task(key, lambda n=number: self._look(stand_off.posture, n), self._look_from)  # type: ignore[misc]
             yield from tell(LookTaken(number, count, record.view is not None, record.reason))
             if record.view is not None:
                 self._views.append(record.view)
@@ -201,7 +209,7 @@ class Calibration:
             return StandOffRecord(found.posture)
 
         asked = {"from": start.to_record()}
-        return (yield from work("stand-off", asked, find, StandOffRecord.to_record, StandOffRecord.from_record))
+        return (yield from work("stand-off", asked, find, StandOffRecord.to_record, self._stand_off_from))
 
     def _look(self, stand_off: Posture, number: int) -> Procedure[LookRecord]:
         reason, taken = "no posture for it keeps clear and shows the target", 0
@@ -210,7 +218,7 @@ class Calibration:
         for number_of_try in range(_TRIES_A_LOOK):
             asked = {"look": number, "try": number_of_try}
             posture = yield from work(
-                "look posture", asked, lambda: next(postures, None), _posture_record, _posture_from
+                "look posture", asked, lambda: next(postures, None), _posture_record, self._posture_from
             )
             if posture is None:
                 break
@@ -240,7 +248,7 @@ class Calibration:
             return planner.plan(requests, start, provisional=False)
 
         asked = {"from": start.to_record(), "for": purpose}
-        return (yield from work("plan", asked, plan, Plan.to_record, Plan.from_record))
+        return (yield from work("plan", asked, plan, Plan.to_record, self._plan_from))
 
     def _adopt_plan(self, plan: Plan) -> Procedure[None]:
         self._plan = plan
@@ -265,7 +273,7 @@ class Calibration:
                 count = request.constraints - len(captured)
                 missing = Request(request.use, count, request.positions, next_number, captured)
                 key = StepKey("plan", f"{request.use}/{next_number:02d}", None, "replacement")
-                again = yield from task(key, lambda r=missing, k=key: self._select([r], k.constraint), Plan)  # type: ignore[misc]
+                again = yield from task(key, lambda r=missing, k=key: self._select([r], k.constraint), self._plan_from)  # type: ignore[misc]
                 plan = self._plan.replaced([*given_up, *queue], again)
                 yield from self._adopt_plan(judged_anew(plan, self._model, self._belief))
                 queue = list(again.constraints)
@@ -300,7 +308,7 @@ class Calibration:
                 alignment = yield from aligner.align(constraint.active, near, goal, T_P_E)
                 return (yield from self._captured(constraint, i, alignment, aligner))
 
-            point = yield from task(key, body, PointRecord)
+            point = yield from task(key, body, lambda record: point_of(record, self._shape))
             yield from tell(_point_done(constraint, i, point))
             self._arrivals_px += point.arrivals_px
             if point.view is not None:
@@ -356,6 +364,27 @@ class Calibration:
         in_camera = (planned - camera[:3, 3]) @ camera[:3, :3]
         return bool(np.any(np.linalg.norm(in_camera[:, :2], axis=1) > ROOM))
 
+    # -- what was recorded --------------------------------------------------------------------------------------
+    # ValueError for what is none of this cell's.
+
+    def _posture_from(self, record: dict[str, Any] | None) -> Posture | None:
+        return None if record is None else self._stand_off_from(record).posture
+
+    def _stand_off_from(self, record: dict[str, Any]) -> StandOffRecord:
+        found = StandOffRecord.from_record(record)
+        self._model.require_joints(found.posture.active, found.posture.passive)
+        return found
+
+    def _look_from(self, record: dict[str, Any]) -> LookRecord:
+        found = LookRecord.from_record(record)
+        _require_view(found.view, self._shape)
+        return found
+
+    def _plan_from(self, record: dict[str, Any]) -> Plan:
+        plan = Plan.from_record(record)
+        plan.require_joints(*self._shape.joints)
+        return plan
+
     # -- both ---------------------------------------------------------------------------------------------------
 
     def _refine(self) -> Procedure[None]:
@@ -393,10 +422,26 @@ def requests_of(procedure: ProcedureConfig) -> list[Request]:
     return [request for request in requests if request.constraints]
 
 
-def captures_of(journal: Journal, cell_sha256: str, started: str | None) -> Captures:
-    """The captures of a run so far, in the order taken; without those of constraints that were given up."""
+def point_of(record: dict[str, Any], shape: CellShape) -> PointRecord:
+    """What came of a point of a cell, as it is recorded; ValueError for anything else."""
+    point = PointRecord.from_record(record)
+    _require_view(point.view, shape)
+    if point.capture is not None:
+        shape.require(point.capture)
+    return point
+
+
+def captures_of(journal: Journal, cell_sha256: str, started: str | None, shape: CellShape | None = None) -> Captures:
+    """The captures of a run so far, in the order taken; without those of constraints that were given up.
+
+    FormatError for a point that cannot be read, or is of another cell than ``shape`` says, where that is given.
+    """
     keys = [key for key, _ in journal.results() if key.kind == "point"]
-    points = [(key, journal.read(key, PointRecord.from_record)) for key in keys]
+
+    def read(record: dict[str, Any]) -> PointRecord:
+        return PointRecord.from_record(record) if shape is None else point_of(record, shape)
+
+    points = [(key, journal.read(key, read)) for key in keys]
     given_up = {key.constraint for key, point in points if point.capture is None}
     captures = [point.capture for key, point in points if point.capture and key.constraint not in given_up]
     return Captures(cell_sha256, started, tuple(captures))
@@ -448,13 +493,34 @@ def _view_record(view: View | None) -> dict[str, Any] | None:
 def _view_from(record: dict[str, Any] | None) -> View | None:
     if record is None:
         return None
-    corners = corners_from_record(record["corners_px"])
-    return View(tuple(record["active_rad"]), tuple(record["passive_rad"]), corners)
+    fields = Fields(record, "the view")
+    corners = corners_from_record(fields.any("corners_px"))
+    return View(fields.finites("active_rad"), fields.finites("passive_rad"), corners)
+
+
+def _require_view(view: View | None, shape: CellShape) -> None:
+    if view is None:
+        return
+    found = (len(view.active), len(view.passive)), len(view.corners)
+    if found != (shape.joints, shape.corners):
+        raise ValueError(f"view: joints and corners are {found}, the cell has {(shape.joints, shape.corners)}")
+
+
+def _servo_from(fields: Fields) -> Servo:
+    jacobian = _matrix_from(fields.any("servo"), "servo")
+    recorded = fields.any("servo_first") if "servo_first" in fields else None
+    first = jacobian if recorded is None else _matrix_from(recorded, "servo_first")
+    if np.linalg.cond(first) > _WORST_CONDITION:
+        raise ValueError("servo_first: nothing can be corrected by it")
+    return Servo(first, jacobian)
+
+
+def _matrix_from(record: Any, name: str) -> Array:
+    rows = expect(record, list, name)
+    if len(rows) != 2:
+        raise ValueError(f"{name} is no matrix of 2 x 2")
+    return np.array([finites(row, name, 2) for row in rows])
 
 
 def _posture_record(posture: Posture | None) -> dict[str, Any] | None:
     return None if posture is None else posture.to_record()
-
-
-def _posture_from(record: dict[str, Any] | None) -> Posture | None:
-    return None if record is None else Posture.from_record(record)

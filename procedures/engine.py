@@ -92,7 +92,7 @@ class Engine:
             self._arrivals[name] = left.arrival + (0 if arm.repeats_targets else 1)
             if left.target is not None:
                 if len(left.target) != arm.robot.joints:
-                    where, what = str(self._session.journal.path), f"'{name}' has {arm.robot.joints} joints"
+                    where, what = self._session.journal.newest_line, f"'{name}' has {arm.robot.joints} joints"
                     raise FormatError([Problem(where, f"{what}, and was left with {len(left.target)}")])
                 self._commanded[name] = left.target
                 self._to_confirm.add(name)
@@ -157,7 +157,7 @@ class Engine:
     def _task(self, task: Task) -> Any:
         finished = self._session.journal.result(task.key)
         if finished is not None:
-            return self._session.journal.read(task.key, task.result.from_record)
+            return self._session.journal.read(task.key, task.read)
         self._recording.step_begun(task.key)
         result = self._drive(task.body())
         self._recording.step_finished(task.key)
@@ -273,7 +273,7 @@ class Engine:
 def _read_recorded(work: Work, recorded: Any) -> Any:
     try:
         return work.read(recorded)
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         what = f"what was worked out as {work.what} cannot be read ({type(error).__name__}: {error})"
         raise LogDamaged("the log", None, what) from error
 

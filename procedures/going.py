@@ -24,7 +24,7 @@ def go(ways: WayFinder, goal: Posture) -> Procedure[bool]:
     """Move both arms to a posture; says whether there was a clear way."""
     start = yield from here()
     asked = {"from": start.to_record(), "to": goal.to_record()}
-    way = yield from work("way", asked, lambda: ways.find(start, goal), _way_to_record, _way_from_record)
+    way = yield from work("way", asked, lambda: ways.find(start, goal), _way_to_record, ways.from_record)
     for leg in way or ():
         yield from move(leg.arm, *leg.waypoints)
     return way is not None
@@ -32,7 +32,3 @@ def go(ways: WayFinder, goal: Posture) -> Procedure[bool]:
 
 def _way_to_record(way: Way) -> Any:
     return None if way is None else [leg.to_record() for leg in way]
-
-
-def _way_from_record(record: Any) -> Way:
-    return None if record is None else tuple(map(Leg.from_record, record))

@@ -40,7 +40,12 @@ def see(model: CellModel, detector: Detector, belief: Belief) -> Procedure[Seen]
     near = predicted if np.all(np.isfinite(predicted)) else None
     image = sighting.frame.image
     found = yield from work(
-        "detection", {}, lambda: detector.detect(image, near), found_to_record, found_from_record, of_image=True
+        "detection",
+        {},
+        lambda: detector.detect(image, near),
+        found_to_record,
+        lambda record: found_from_record(record, len(model.board.corners)),
+        of_image=True,
     )
     yield Mark(sighting.frame.time, _feature(found))
     if isinstance(found, Missed):

@@ -28,7 +28,7 @@ class Record(Protocol):
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
-        """The same result again, to the last bit."""
+        """The same result again, to the last bit; ValueError for anything else."""
         ...
 
 
@@ -122,19 +122,21 @@ class Tell:
 class Task:
     """A part of the procedure whose result is journalled under ``key`` when it is finished.
 
-    In a run that goes on from a journal, a finished key is answered from there and the body is not run.
+    In a run that goes on from a journal, a finished key is answered from there by ``read``, which raises ValueError for
+    what is no result of this cell's, and the body is not run.
     """
 
     key: StepKey
     body: Callable[[], Procedure[Any]]
-    result: type[Record]
+    read: Callable[[dict[str, Any]], Record]
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
     """Something to work out that takes no device. It is recorded, and a replay answers it from the recording.
 
-    what, asked: what is to be worked out, and for what, as plain JSON; write, read: the result as plain JSON and back.
+    what, asked: what is to be worked out, and for what, as plain JSON; write, read: the result as plain JSON and back,
+    with ValueError for what is none.
     of_image: worked out from an image, so a replay that has the very same image works it out anew.
     """
 
@@ -191,7 +193,7 @@ def work(
     return reply
 
 
-def task(key: StepKey, body: Callable[[], Procedure[R]], result: type[R]) -> Procedure[R]:
+def task(key: StepKey, body: Callable[[], Procedure[R]], read: Callable[[dict[str, Any]], R]) -> Procedure[R]:
     """The result of ``body``, or the one that the journal has for ``key``."""
-    reply: R = yield Task(key, body, result)
+    reply: R = yield Task(key, body, read)
     return reply

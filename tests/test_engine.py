@@ -285,8 +285,8 @@ def test_a_finished_task_is_answered_from_the_journal_and_not_done_again(engine)
         return Note(1 / 3)
 
     def procedure():
-        first = yield from task(key, body, Note)
-        again = yield from task(key, body, Note)
+        first = yield from task(key, body, Note.from_record)
+        again = yield from task(key, body, Note.from_record)
         return first, again
 
     assert engine.run(procedure()) == (Note(1 / 3), Note(1 / 3))
@@ -301,7 +301,7 @@ def test_a_task_that_fails_is_not_finished(engine):
 
     def procedure():
         try:
-            yield from task(key, body, Note)
+            yield from task(key, body, Note.from_record)
         except CommandRefused:
             return "failed"
 

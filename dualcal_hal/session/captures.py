@@ -12,9 +12,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
+from dualcal_hal.config import CellConfig
 from dualcal_hal.errors import FormatError, Problem
 from dualcal_hal.robot import Joints
 from dualcal_hal.session.files import read_document, write_document
+from dualcal_hal.session.plain import LARGEST
 
 FORMAT = "dualcal.captures/1"
 
@@ -86,6 +88,30 @@ class Captures:
     captures: tuple[CaptureRecord, ...]
 
 
+@dataclass(frozen=True)
+class CellShape:
+    """What the captures of a cell have: joints of the active and the passive arm, corners and the index of the feature
+    point among them, the image's width and height, px.
+    """
+
+    joints: tuple[int, int]
+    corners: int
+    feature: int
+    image_size: tuple[int, int]
+
+    @classmethod
+    def of(cls, cell: CellConfig) -> CellShape:
+        board = cell.target.board
+        joints = cell.active.chain.joints, cell.passive.chain.joints
+        return cls(joints, len(board.corners), board.feature, cell.camera.intrinsics.size)
+
+    def require(self, capture: CaptureRecord) -> None:
+        """FormatError for a capture that is of another cell."""
+        problems = list(_mismatches(capture, self.joints, self.corners, self.image_size))
+        if problems := problems or list(_stray_feature(capture, self.feature)):
+            raise FormatError(problems)
+
+
 def write_captures(path: Path, captures: Captures) -> None:
     """Write the public file atomically."""
     header = {"cell_sha256": captures.cell_sha256, "started": captures.started}
@@ -117,18 +143,16 @@ def read_captures(
         problems += wrong
         if entry is not None:
             entries.append(entry)
-            problems += _mismatches(entry, joints, corners)
-            if image_size is not None and entry.image_px != image_size:
-                what = f"image_px: {_by(entry.image_px)} px, the cell's camera has {_by(image_size)}"
-                problems.append(Problem(entry.id, what))
-            problems += _stray_feature(entry, feature)
+            capture = entry.capture(entry.active_arrival or 0)
+            problems += _mismatches(capture, joints, corners, image_size)
+            problems += _stray_feature(capture, feature)
     problems += _duplicates([_name(record, index) for index, record in enumerate(raw)] if isinstance(raw, list) else [])
     if problems:
         raise FormatError(problems)
     return Captures(document.get("cell_sha256"), document.get("started"), tuple(_with_arrivals(entries)))
 
 
-_Finite = Annotated[float, Field(strict=True)]
+_Finite = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST)]
 _Whole = Annotated[int, Field(strict=True)]
 _Size = Annotated[int, Field(strict=True, gt=0)]
 _Joints = Annotated[tuple[_Finite, ...], Field(min_length=1)]
@@ -227,28 +251,33 @@ def _duplicates(names: Sequence[str]) -> Iterator[Problem]:
             yield Problem(name, f"id: used by {count} captures")
 
 
-def _stray_feature(entry: _Entry, feature: int | None) -> Iterator[Problem]:
-    if feature is None or entry.corners_px is None or feature >= len(entry.corners_px):
+def _stray_feature(capture: CaptureRecord, feature: int | None) -> Iterator[Problem]:
+    if feature is None or capture.corners is None or feature >= len(capture.corners):
         return
-    corner = entry.corners_px[feature]
+    corner = capture.corners[feature]
     if corner is None:
         return
-    if max(abs(corner[0] - entry.feature_px[0]), abs(corner[1] - entry.feature_px[1])) > FARTHEST_FEATURE:
-        yield Problem(entry.id, f"feature_px: {entry.feature_px} is not corner {feature} of corners_px, {corner}")
+    if max(abs(corner[0] - capture.feature[0]), abs(corner[1] - capture.feature[1])) > FARTHEST_FEATURE:
+        yield Problem(capture.id, f"feature_px: {capture.feature} is not corner {feature} of corners_px, {corner}")
 
 
 def _by(size: tuple[int, int]) -> str:
     return f"{size[0]} x {size[1]}"
 
 
-def _mismatches(entry: _Entry, joints: tuple[int, int] | None, corners: int | None) -> Iterator[Problem]:
+def _mismatches(
+    capture: CaptureRecord, joints: tuple[int, int] | None, corners: int | None, image_size: tuple[int, int] | None
+) -> Iterator[Problem]:
     if joints is not None:
-        both = (entry.active_joints_rad, entry.passive_joints_rad)
+        both = (capture.active_joints, capture.passive_joints)
         for key, angles, expected in zip(("active", "passive"), both, joints, strict=True):
             if len(angles) != expected:
-                yield Problem(entry.id, f"{key}_joints_rad: {len(angles)} joint angles, the arm has {expected}")
-    if corners is not None and entry.corners_px is not None and len(entry.corners_px) != corners:
-        yield Problem(entry.id, f"corners_px: {len(entry.corners_px)} corners, the target has {corners}")
+                yield Problem(capture.id, f"{key}_joints_rad: {len(angles)} joint angles, the arm has {expected}")
+    if corners is not None and capture.corners is not None and len(capture.corners) != corners:
+        yield Problem(capture.id, f"corners_px: {len(capture.corners)} corners, the target has {corners}")
+    if image_size is not None and capture.image_size != image_size:
+        what = f"image_px: {_by(capture.image_size)} px, the cell's camera has {_by(image_size)}"
+        yield Problem(capture.id, what)
 
 
 def _with_arrivals(entries: Sequence[_Entry]) -> Iterator[CaptureRecord]:

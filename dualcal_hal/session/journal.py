@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -13,6 +12,7 @@ from typing import Any, TypeVar
 from dualcal_hal.errors import FormatError, Problem
 from dualcal_hal.robot import Joints
 from dualcal_hal.session.files import write_atomically
+from dualcal_hal.session.plain import Fields, parse
 
 T = TypeVar("T")
 
@@ -28,6 +28,13 @@ class StepKey:
     position: int | None
     kind: str
 
+    @classmethod
+    def from_fields(cls, fields: Fields) -> StepKey:
+        """As ``asdict`` wrote it; ValueError."""
+        constraint = None if fields.is_null("constraint") else fields.text("constraint")
+        position = None if fields.is_null("position") else fields.whole("position")
+        return cls(fields.text("phase"), constraint, position, fields.text("kind"))
+
 
 @dataclass(frozen=True)
 class Standing:
@@ -42,14 +49,9 @@ class Standing:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Standing:
-        """And back, to the last bit."""
-        target, arrival = record["target_rad"], record["arrival"]
-        if type(arrival) is not int or arrival < 0:
-            raise ValueError(f"arrival: {arrival!r} is no count")
-        joints = None if target is None else tuple(map(float, target))
-        if joints is not None and not all(map(math.isfinite, joints)):
-            raise ValueError("target_rad: is not finite")
-        return cls(joints, arrival)
+        """And back, to the last bit; ValueError."""
+        fields = Fields(record)
+        return cls(None if fields.is_null("target_rad") else fields.finites("target_rad"), fields.whole("arrival"))
 
 
 @dataclass(frozen=True)
@@ -94,13 +96,18 @@ class Journal:
         return self._results.get(key)
 
     def read(self, key: StepKey, from_record: Callable[[dict[str, Any]], T]) -> T:
-        """The result of a finished step as ``from_record`` reads it; FormatError if it is no such result."""
+        """The result of a finished step as ``from_record`` reads it; FormatError if it cannot be read."""
         try:
             return from_record(self._results[key])
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             number = 2 + list(self._results).index(key)
             what = f"the result of step {key} cannot be read ({type(error).__name__}: {error})"
             raise FormatError([Problem(f"{self.path}:{number}", what)]) from error
+
+    @property
+    def newest_line(self) -> str:
+        """The file and the number of its last line, which says how everything was left."""
+        return f"{self.path}:{1 + len(self._results)}"
 
     def results(self) -> list[tuple[StepKey, dict[str, Any]]]:
         """All finished steps in the order in which they were finished."""
@@ -143,25 +150,26 @@ class Journal:
         problems = []
         for number, line in enumerate(content[: self._length].split(b"\n")[:-1], start=1):
             try:
-                entry = json.loads(line)
+                entry = Fields(parse(line), "the line")
                 if number == 1:
                     self._read_header(entry)
                 else:
                     self._read_entry(entry)
-            except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            except ValueError as error:
                 problems.append(Problem(f"{self.path}:{number}", f"not a line of a journal: {error}"))
         if problems:
             raise FormatError(problems)
 
-    def _read_header(self, header: Any) -> None:
-        if header["format"] != JOURNAL_FORMAT:
-            raise ValueError(f"unknown format {header['format']!r}, expected {JOURNAL_FORMAT!r}")
-        self.started = header.get("started")
+    def _read_header(self, header: Fields) -> None:
+        if header.any("format") != JOURNAL_FORMAT:
+            raise ValueError(f"unknown format {header.any('format')!r}, expected {JOURNAL_FORMAT!r}")
+        self.started = header.text("started") if "started" in header else None
 
-    def _read_entry(self, entry: Any) -> None:
-        key = StepKey(**entry["step"])
+    def _read_entry(self, entry: Fields) -> None:
+        key = StepKey.from_fields(entry.part("step"))
         if key in self._results:
             raise ValueError(f"step {key} is finished already")
-        arms = {name: Standing.from_record(record) for name, record in entry.get("arms", {}).items()}
-        self._results[key] = entry["result"]
-        self.left = Left(arms, dict(entry.get("backends", {})))
+        arms = entry.part("arms").content if "arms" in entry else {}
+        backends = entry.part("backends").content if "backends" in entry else {}
+        left = Left({name: Standing.from_record(record) for name, record in arms.items()}, backends)
+        self._results[key], self.left = entry.part("result").content, left

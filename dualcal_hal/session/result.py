@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -118,7 +118,7 @@ def read_result(path: Path) -> Result:
         return _from_document(document)
     except KeyError as error:
         raise FormatError([Problem(str(path), f"key {error} is missing")]) from error
-    except (TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
         raise FormatError([Problem(str(path), f"is not a result: {error}")]) from error
 
 
@@ -199,27 +199,53 @@ def _truth_error(error: TruthError) -> dict[str, Any]:
 def _from_document(document: Mapping[str, Any]) -> Result:
     transforms, mismatch, truth = document["transforms"], document["mismatch_mm"], document["truth_error"]
     return Result(
-        method=document["method"],
+        method=_text(document["method"]),
         T_P_A=_matrix(transforms[T_P_A_NAME]["matrix"]),
         T_H_E=_matrix(transforms[T_H_E_NAME]["matrix"]),
-        optical_axis=np.array(document["optical_axis_in_active_flange"], dtype=float),
-        unobservable=tuple(Unobservable(u["what"], tuple(u["direction"]), u["of"]) for u in document["unobservable"]),
-        iterations=tuple(document["iterations"]),
+        optical_axis=_array(document["optical_axis_in_active_flange"], (3,)),
+        unobservable=tuple(
+            Unobservable(_text(u["what"]), tuple(map(float, u["direction"])), _text(u["of"]))
+            for u in document["unobservable"]
+        ),
+        iterations=tuple(map(_record, document["iterations"])),
         mismatch_before=None if mismatch is None else _in_m(mismatch["before"]),
         mismatch_after=None if mismatch is None else _in_m(mismatch["after"]),
-        captures_used=tuple(document["captures_used"]),
-        captures_rejected=tuple(Rejected(r["id"], r["reason"]) for r in document["captures_rejected"]),
-        verdict=document["verdict"],
-        reasons=tuple(document["reasons"]),
+        captures_used=tuple(map(_text, document["captures_used"])),
+        captures_rejected=tuple(Rejected(_text(r["id"]), _text(r["reason"])) for r in document["captures_rejected"]),
+        verdict=_verdict(document["verdict"]),
+        reasons=tuple(map(_text, document["reasons"])),
         truth_error=None if truth is None else _truth_error_from(truth),
     )
 
 
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"{str(value)[:60]} where text is needed")
+    return value
+
+
+def _verdict(value: Any) -> Verdict:
+    if value not in get_args(Verdict):
+        raise ValueError(f"there is no verdict {str(value)[:60]}")
+    return cast(Verdict, value)
+
+
+def _record(value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{str(value)[:60]} where an object is needed")
+    return value
+
+
 def _matrix(rows: Any) -> Array:
-    T = np.array(rows, dtype=float)
-    if T.shape != (4, 4):
-        raise ValueError(f"a matrix of shape {T.shape} where 4 x 4 is needed")
-    return T
+    return _array(rows, (4, 4))
+
+
+def _array(values: Any, shape: tuple[int, ...]) -> Array:
+    array = np.array(values, dtype=float)
+    if array.shape != shape:
+        needed = " x ".join(map(str, shape))
+        raise ValueError(f"an array of shape {array.shape} where {needed} is needed")
+    return array
 
 
 def _in_m(mismatch: Mapping[str, Any]) -> Mismatch:
@@ -231,7 +257,7 @@ def _truth_error_from(truth: Mapping[str, Any]) -> TruthError:
     base, camera = truth[T_P_A_NAME], truth[T_H_E_NAME]
     return TruthError(
         base_rotation=float(np.radians(base["rotation_deg"])),
-        base_translation=base["translation_mm"] / 1e3,
+        base_translation=float(base["translation_mm"]) / 1e3,
         camera_axis=float(np.radians(camera["axis_deg"])),
-        camera_sideways=camera["sideways_mm"] / 1e3,
+        camera_sideways=float(camera["sideways_mm"]) / 1e3,
     )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dualcal_hal.session.plain import Fields, expect, finites
 from dualcal_hal.transforms import Array
 
 Region = tuple[int, int, int, int]
@@ -85,16 +86,20 @@ def found_to_record(found: Detection | Missed) -> dict[str, Any]:
     }
 
 
-def found_from_record(record: dict[str, Any]) -> Detection | Missed:
-    """And back, to the last bit."""
-    if "missed" in record:
-        return Missed(Miss(record["missed"]), record["detail"])
+def found_from_record(record: dict[str, Any], corners: int) -> Detection | Missed:
+    """And back, to the last bit; ValueError for what is none of a target with so many corners."""
+    fields = Fields(record, "the detection")
+    if "missed" in fields:
+        return Missed(Miss(fields.text("missed")), fields.text("detail"))
+    index = fields.whole("feature_index")
+    if index >= corners:
+        raise ValueError(f"feature_index: there are {corners} corners")
     return Detection(
-        corners_from_record(record["corners_px"]),
-        record["order_known"],
-        record["blur_px"],
-        record["contrast"],
-        record["feature_index"],
+        corners_from_record(fields.any("corners_px"), corners),
+        fields.flag("order_known"),
+        fields.finite("blur_px"),
+        fields.finite("contrast"),
+        index,
     )
 
 
@@ -103,6 +108,10 @@ def corners_to_record(corners: Array) -> tuple[tuple[float, float] | None, ...]:
     return tuple((float(u), float(v)) if np.isfinite(u) else None for u, v in corners)
 
 
-def corners_from_record(record: Any) -> Array:
-    """And back: (n, 2) px, NaN for one that was not seen."""
-    return np.array([corner or (np.nan, np.nan) for corner in record], dtype=float)
+def corners_from_record(record: Any, count: int | None = None) -> Array:
+    """And back: (n, 2) px, NaN for one that was not seen; ValueError for anything else, or not ``count`` of them."""
+    pixels = expect(record, list, "corners_px")
+    if not pixels or len(pixels) != (count or len(pixels)):
+        raise ValueError(f"corners_px: {len(pixels)} corners where there are {count or 'some'}")
+    unseen = (np.nan, np.nan)
+    return np.array([unseen if each is None else finites(each, "corners_px", 2) for each in pixels], dtype=float)

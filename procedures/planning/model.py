@@ -16,6 +16,7 @@ from dualcal_hal.geometry import CellGeometry
 from dualcal_hal.geometry.exact import ExactCell
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.robot import Joints
+from dualcal_hal.session.plain import Fields
 from dualcal_hal.target import Target
 from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.estimation.projection import project
@@ -116,8 +117,9 @@ class Posture:
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
-        """And back, to the last bit."""
-        return cls(tuple(record["active_rad"]), tuple(record["passive_rad"]))
+        """And back, to the last bit; ValueError."""
+        fields = Fields(record, "the posture")
+        return cls(fields.finites("active_rad"), fields.finites("passive_rad"))
 
 
 class CellModel:
@@ -141,6 +143,12 @@ class CellModel:
         self._T_H_E = self.nominal.T_H_E
         # The plate may not leave the image either: its margin helps nobody but the eye that looks for the corners.
         self._in_view = np.concatenate([self.board.corners, self.board.outline])
+
+    def require_joints(self, active: Joints, passive: Joints) -> None:
+        """ValueError where these angles, which come from somewhere else, are not as many as the arms have joints."""
+        for arm, angles in ((self.active, active), (self.passive, passive)):
+            if len(angles) != arm.chain.joints:
+                raise ValueError(f"'{arm.name}' has {arm.chain.joints} joints, not {len(angles)}")
 
     @cached_property
     def exact(self) -> ExactCell:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, cast, get_args
 
 from dualcal_hal.robot import Joints
 from dualcal_hal.session.captures import Use
+from dualcal_hal.session.plain import Fields
 
 PLAN_FORMAT = "dualcal.plan/2"
+
+_NAME = re.compile(r"[a-z]+/[0-9]{2,6}")
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,9 @@ class PlannedPosition:
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
-        passive = tuple(record["passive_joints_rad"])
-        return cls(passive, record["distance_m"], record["tilt_rad"], record["clearance_m"])
+        fields = Fields(record, "the position")
+        passive = fields.finites("passive_joints_rad")
+        return cls(passive, fields.finite("distance_m"), fields.finite("tilt_rad"), fields.finite("clearance_m"))
 
 
 @dataclass(frozen=True)
@@ -74,15 +79,21 @@ class PlannedConstraint:
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
-        positions = tuple(PlannedPosition.from_record(position) for position in record["positions"])
+        fields = Fields(record, "the constraint")
+        name, use = fields.text("constraint"), fields.choice("use", get_args(Use))
+        if _NAME.fullmatch(name) is None:
+            raise ValueError(f"constraint is no name of one: {name[:60]!r}")
+        positions = tuple(PlannedPosition.from_record(position) for position in fields.items("positions"))
+        if not positions:
+            raise ValueError("positions is empty")
         return cls(
-            record["constraint"],
-            record["use"],
-            tuple(record["active_joints_rad"]),
+            name,
+            cast(Use, use),
+            fields.finites("active_joints_rad"),
             positions,
-            record["manipulability"],
-            record["joint_margin_rad"],
-            record["expected_s"],
+            fields.finite("manipulability"),
+            fields.finite("joint_margin_rad"),
+            fields.finite("expected_s"),
         )
 
 
@@ -139,11 +150,22 @@ class Plan:
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
-        constraints = tuple(PlannedConstraint.from_record(constraint) for constraint in record["constraints"])
+        fields = Fields(record, "the plan")
+        refused = fields.part("refused_candidates")
         return cls(
-            constraints,
-            record["axis_spread"],
-            record["refused_candidates"],
-            record["provisional"],
-            record["planned_from"],
+            tuple(PlannedConstraint.from_record(constraint) for constraint in fields.items("constraints")),
+            None if fields.is_null("axis_spread") else fields.finite("axis_spread"),
+            {what: refused.whole(what) for what in refused.content},
+            fields.flag("provisional"),
+            fields.text("planned_from"),
         )
+
+    def require_joints(self, active: int, passive: int) -> None:
+        """ValueError where its postures, which come from somewhere else, are not of arms with so many joints."""
+        for constraint in self.constraints:
+            if len(constraint.active) != active:
+                raise ValueError(f"{constraint.name}: the active arm has {active} joints, not {len(constraint.active)}")
+            for position in constraint.positions:
+                if len(position.passive) != passive:
+                    what = f"the passive arm has {passive} joints, not {len(position.passive)}"
+                    raise ValueError(f"{constraint.name}: {what}")

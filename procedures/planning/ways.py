@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from dualcal_hal.geometry import CellGeometry
 from dualcal_hal.robot import Joints
+from dualcal_hal.session.plain import Fields, expect, finites
 from dualcal_hal.transforms import Array
 from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel, Posture
@@ -40,8 +41,12 @@ class Leg:
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
-        """And back, to the last bit."""
-        return cls(record["arm"], tuple(map(tuple, record["waypoints_rad"])))
+        """And back, to the last bit; ValueError."""
+        fields = Fields(record, "the leg")
+        waypoints = tuple(finites(each, "waypoints_rad") for each in fields.items("waypoints_rad"))
+        if not waypoints:
+            raise ValueError("waypoints_rad is empty")
+        return cls(fields.text("arm"), waypoints)
 
 
 class WayFinder:
@@ -60,6 +65,20 @@ class WayFinder:
         points = [_point(posture) for posture in retreats]
         self._together = Search(movers, belief.placement, points)
         self._alone = [Search([replace(mover, is_alone=True)], belief.placement, points) for mover in movers]
+
+    def from_record(self, record: Any) -> tuple[Leg, ...] | None:
+        """A way of these arms that was recorded; ValueError for anything else."""
+        if record is None:
+            return None
+        way = tuple(map(Leg.from_record, expect(record, list, "the way")))
+        for leg in way:
+            mover = self._movers.get(leg.arm)
+            if mover is None:
+                raise ValueError(f"there is no arm {leg.arm[:60]!r}")
+            joints = mover.arm.chain.joints
+            if any(len(waypoint) != joints for waypoint in leg.waypoints):
+                raise ValueError(f"'{leg.arm}' has {joints} joints")
+        return way
 
     def find(self, start: Posture, goal: Posture) -> tuple[Leg, ...] | None:
         """Legs from start to goal, or None if no way was found that keeps clear.

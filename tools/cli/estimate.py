@@ -11,7 +11,7 @@ from rich.console import Console
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.config import CellConfig
 from dualcal_hal.errors import FormatError, UsageError
-from dualcal_hal.session.captures import Captures, read_captures
+from dualcal_hal.session.captures import Captures, CellShape, read_captures
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.result import Rejected, read_truth, with_truth_error, write_result
 from dualcal_hal.transforms import Array
@@ -115,7 +115,7 @@ def _journalled(folder: Path, file: CellFile, *, required: bool) -> Captures | N
     """The captures that the session's journal has; None for a damaged one that is not required."""
     try:
         journal = Session(folder).journal
-        return captures_of(journal, file.sha256, None)
+        return captures_of(journal, file.sha256, None, CellShape.of(file.cell))
     except FormatError:
         if required:
             raise

@@ -16,8 +16,9 @@ from rich.console import Console
 from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import CellFile, differences, load_cell, standing_alone
 from dualcal_hal.clock import utc_now
+from dualcal_hal.config import CellConfig
 from dualcal_hal.errors import FormatError, Problem, UsageError
-from dualcal_hal.session.captures import Captures, write_captures
+from dualcal_hal.session.captures import Captures, CellShape, write_captures
 from dualcal_hal.session.distances import DISTANCES, Distances, read_distances
 from dualcal_hal.session.folder import CELL_FILE, Session
 from dualcal_hal.session.lock import SessionLock
@@ -37,6 +38,8 @@ from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.progress import progress
 from tools.cli.show import show_rehearsal, show_result
 from tools.cli.truth import simulated_truth
+
+PLAN_FILE = "plan.json"
 
 
 @dataclass(frozen=True)
@@ -148,7 +151,7 @@ def go_on_from_journal(cell: Cell, session: Session) -> None:
     try:
         cell.go_on_from(session.journal.left.backends)
     except FormatError as error:
-        where = session.journal.path
+        where = session.journal.newest_line
         raise FormatError([Problem(f"{where}: {each.where}", each.what) for each in error.problems]) from error
 
 
@@ -209,7 +212,7 @@ def _rehearse(console: Console, file: CellFile, model: CellModel, options: RunOp
         return
     session = Session.create(options.out, file.text)
     if rehearsal.plan is not None:
-        session.write_document("plan.json", rehearsal.plan.to_record())
+        session.write_document(PLAN_FILE, rehearsal.plan.to_record())
     draw_plan(session.folder / "plan.png", file.cell, rehearsal.arms, rehearsal.plan)
     console.print(f"plan and picture: {session.folder}", soft_wrap=True, highlight=False)
 
@@ -239,7 +242,7 @@ def write_session_captures(file: CellFile, session: Session) -> Captures:
 
 
 def _captures(file: CellFile, session: Session) -> Captures:
-    return captures_of(session.journal, file.sha256, session.started)
+    return captures_of(session.journal, file.sha256, session.started, CellShape.of(file.cell))
 
 
 def execute(
@@ -287,13 +290,24 @@ def conclude(file: CellFile, session: Session, captures: Captures) -> Result:
     draw_summary(
         session.summary_path,
         cell=file.cell,
-        plan=Plan.from_record(session.read_document("plan.json", PLAN_FORMAT)),
+        plan=_read_plan(session, file.cell),
         captures=captures,
         result=result,
         image=session.read_image(shown.id),
         feature_px=shown.feature,
     )
     return result
+
+
+def _read_plan(session: Session, cell: CellConfig) -> Plan:
+    """``plan.json``; FormatError if it is none of this cell's."""
+    record = session.read_document(PLAN_FILE, PLAN_FORMAT)
+    try:
+        plan = Plan.from_record(record)
+        plan.require_joints(cell.active.chain.joints, cell.passive.chain.joints)
+    except ValueError as error:
+        raise FormatError([Problem(str(session.folder / PLAN_FILE), str(error))]) from error
+    return plan
 
 
 def analyse_session(file: CellFile, session: Session, captures: Captures) -> Result:

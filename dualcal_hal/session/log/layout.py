@@ -20,6 +20,7 @@ from dualcal_hal.session.log.records import (
     Worked,
     schema_of,
 )
+from dualcal_hal.session.plain import Fields, parse
 
 FORMAT_NAME, FORMAT_VERSION = "dualcal.log", 1
 PROFILE = f"{FORMAT_NAME}/{FORMAT_VERSION}"
@@ -30,6 +31,9 @@ LARGEST_RECORD = 1 << 26
 
 MOST_ARMS = 16
 """A log that names more is none."""
+
+LONGEST_NAME = 1000
+"""Letters of a device's name: it is in a topic, and all topics are in every copy of a log."""
 
 RECORD_TOPICS: dict[type[Record], str] = {
     Call: "/dualcal/calls",
@@ -122,13 +126,13 @@ class Layout:
     def from_text(text: str) -> Layout:
         """And back; ValueError if it is none."""
         try:
-            content = json.loads(text)
-            arms, camera = content["arms"], content["camera"]
-        except (KeyError, TypeError, RecursionError) as error:
-            raise ValueError("the list of devices is damaged") from error
-        if not (isinstance(arms, list) and all(isinstance(arm, str) for arm in arms) and isinstance(camera, str)):
-            raise ValueError("the list of devices is damaged")
-        return Layout(tuple(arms), camera)
+            fields = Fields(parse(text.encode()), "the list of devices")
+            arms, camera = fields.texts("arms"), fields.text("camera")
+        except ValueError as error:
+            raise ValueError(f"the list of devices is damaged: {error}") from error
+        if any(len(name) > LONGEST_NAME for name in (*arms, camera)):
+            raise ValueError(f"a device's name has more than {LONGEST_NAME} letters")
+        return Layout(arms, camera)
 
     @staticmethod
     def of_topics(topics: list[str]) -> Layout:

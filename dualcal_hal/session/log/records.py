@@ -9,13 +9,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
 from dualcal_hal import errors
 from dualcal_hal.errors import DeviceError, DualcalError, LogDamaged, Problem
 from dualcal_hal.robot import JointPath, Joints, Mode, MotionState, RobotState, StopResult
 from dualcal_hal.session.journal import StepKey
+from dualcal_hal.session.plain import SPECIAL, Fields, expect, number_in_text, parse
 
 LONGEST_RECORD = 1 << 24
 """Bytes of JSON that are read as one record."""
@@ -155,18 +156,15 @@ Record = Call | Reply | MotionEnded | Arrived | StepBegun | StepFinished | Worke
 def to_json(record: Record) -> bytes:
     """One line of JSON; ValueError for a ``result`` that holds what JSON has not."""
     document = _FORMS[type(record)].write(record)
-    return json.dumps(document, allow_nan=False, ensure_ascii=False, separators=(",", ":")).encode()
+    # A device's text may be no Unicode, such as the name of a file: what has no letter then is a question mark.
+    return json.dumps(document, allow_nan=False, ensure_ascii=False, separators=(",", ":")).encode(errors="replace")
 
 
 def from_json(kind: type[Record], data: bytes) -> Record:
     """The record again; ValueError says what is wrong with it."""
     if len(data) > LONGEST_RECORD:
         raise ValueError(f"a record of {len(data)} bytes is not read")
-    try:
-        document = json.loads(data, parse_constant=_refuse_constant)
-        record: Record = _FORMS[kind].read(_Fields(document))
-    except RecursionError:
-        raise ValueError("the record is nested too deeply") from None
+    record: Record = _FORMS[kind].read(_Fields(parse(data)))
     return record
 
 
@@ -178,10 +176,6 @@ def schema_of(kind: type[Record]) -> dict[str, Any]:
         "description": " ".join((kind.__doc__ or "").split()),
         **_object(**_FORMS[kind].schema),
     }
-
-
-def _refuse_constant(constant: str) -> float:
-    raise ValueError(f"{constant} is no JSON")
 
 
 # Parts of records, written
@@ -246,50 +240,14 @@ def _or_none(write: Callable[[Any], Any], value: Any) -> Any:
 # Parts of records, read. Every method raises ValueError for what is not of its kind.
 
 
-@dataclass
-class _Fields:
-    """A JSON object whose members are asked for by name and kind."""
-
-    content: Any
-    _where: str = field(default="the record")
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.content, dict):
-            raise ValueError(f"{self._where} is no JSON object")
-
-    def any(self, name: str) -> Any:
-        if name not in self.content:
-            raise ValueError(f"{self._where} has no {name!r}")
-        return self.content[name]
-
-    def text(self, name: str) -> str:
-        text: str = _expect(self.any(name), str, name)
-        return text
-
-    def flag(self, name: str) -> bool:
-        flag: bool = _expect(self.any(name), bool, name)
-        return flag
-
-    def whole(self, name: str) -> int:
-        value = self.any(name)
-        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-            raise ValueError(f"{name} is no whole number from 0 up")
-        return value
+class _Fields(Fields):
+    """The same with what devices send: numbers that may be none, and values of the kinds that are recorded."""
 
     def number(self, name: str) -> float:
-        return _read_number(self.any(name), name)
+        return number_in_text(self.any(name), name)
 
     def joints(self, name: str) -> Joints:
         return _read_joints(self.any(name), name)
-
-    def part(self, name: str) -> _Fields:
-        return _Fields(self.any(name), name)
-
-    def part_or_none(self, name: str) -> _Fields | None:
-        return None if self.any(name) is None else self.part(name)
-
-    def texts(self, name: str) -> tuple[str, ...]:
-        return tuple(_expect(each, str, name) for each in _expect(self.any(name), list, name))
 
     def value(self, name: str) -> Value:
         return _read_value(self.any(name), name)
@@ -298,29 +256,8 @@ class _Fields:
         return {key: _read_value(value, key) for key, value in self.part(name).content.items()}
 
 
-def _expect(value: Any, kind: type[Any], name: str) -> Any:
-    if not isinstance(value, kind):
-        raise ValueError(f"{name} is no {_KIND_NAMES[kind]}")
-    return value
-
-
-_KIND_NAMES: dict[type[Any], str] = {str: "text", bool: "true or false", list: "list", dict: "object"}
-_SPECIAL = ("nan", "inf", "-inf")
-
-
-def _read_number(value: Any, name: str) -> float:
-    if isinstance(value, str) and value in _SPECIAL:
-        return float(value)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{name} is no number")
-    try:
-        return float(value)
-    except OverflowError:
-        raise ValueError(f"{name} is too large") from None
-
-
 def _read_joints(value: Any, name: str) -> Joints:
-    return tuple(_read_number(each, name) for each in _expect(value, list, name))
+    return tuple(number_in_text(each, name) for each in expect(value, list, name))
 
 
 def _read_state(fields: _Fields) -> RobotState:
@@ -335,7 +272,7 @@ def _read_state(fields: _Fields) -> RobotState:
 
 
 def _read_path(fields: _Fields) -> JointPath:
-    waypoints = _expect(fields.any("waypoints_rad"), list, "waypoints_rad")
+    waypoints = expect(fields.any("waypoints_rad"), list, "waypoints_rad")
     return JointPath(
         tuple(_read_joints(waypoint, "waypoints_rad") for waypoint in waypoints),
         fields.joints("speed_rad_s"),
@@ -347,7 +284,7 @@ def _read_value(value: Any, name: str) -> Value:
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):
-        return _read_number(value, name)
+        return number_in_text(value, name)
     fields = _Fields(value, name)
     match list(fields.content):
         case ["number"]:
@@ -363,16 +300,6 @@ def _read_value(value: Any, name: str) -> Value:
             frame = fields.part("frame")
             return FrameRef(frame.text("camera"), frame.whole("sequence"), frame.number("time_s"))
     raise ValueError(f"{name} is of no known kind")
-
-
-def _read_key(fields: _Fields) -> StepKey:
-    constraint, position = fields.any("constraint"), fields.any("position")
-    return StepKey(
-        fields.text("phase"),
-        None if constraint is None else fields.text("constraint"),
-        None if position is None else fields.whole("position"),
-        fields.text("kind"),
-    )
 
 
 def _read_error(fields: _Fields | None) -> RecordedError | None:
@@ -416,7 +343,7 @@ def _check_error_fields(kind: type[DualcalError], fields: _Fields) -> None:
         for name in _DEVICE_FIELDS:
             fields.text(name)
     elif issubclass(kind, errors.CellFileError | errors.FormatError):
-        for problem in _expect(fields.any("problems"), list, "problems"):
+        for problem in expect(fields.any("problems"), list, "problems"):
             _Fields(problem, "problem").text("where")
             _Fields(problem, "problem").text("what")
     elif issubclass(kind, LogDamaged):
@@ -451,7 +378,7 @@ def _nullable(schema: Mapping[str, Any]) -> dict[str, Any]:
 
 _TEXT = {"type": "string"}
 _WHOLE = {"type": "integer", "minimum": 0}
-_NUMBER = {"anyOf": [{"type": "number"}, {"enum": list(_SPECIAL)}]}
+_NUMBER = {"anyOf": [{"type": "number"}, {"enum": list(SPECIAL)}]}
 _NUMBERS = {"type": "array", "items": _NUMBER}
 _STATE = _object(
     positions_rad=_NUMBERS,
@@ -465,7 +392,7 @@ _PATH = _object(waypoints_rad={"type": "array", "items": _NUMBERS}, speed_rad_s=
 _VALUE = {
     "anyOf": [
         {"type": ["null", "boolean", "number", "string"]},
-        _object(number={"enum": list(_SPECIAL)}),
+        _object(number={"enum": list(SPECIAL)}),
         _object(state=_STATE),
         _object(path=_PATH),
         _object(stop=_object(confirmed={"type": "boolean"}, detail=_TEXT)),
@@ -492,7 +419,7 @@ def _of_device(record: Call | Reply | MotionEnded | Arrived) -> dict[str, Any]:
 def _step_form(kind: type[StepBegun] | type[StepFinished]) -> _Form:
     return _Form(
         lambda r: {"step": asdict(r.key), "time_s": _number(r.time)},
-        lambda f: kind(_read_key(f.part("step")), f.number("time_s")),
+        lambda f: kind(StepKey.from_fields(f.part("step")), f.number("time_s")),
         {"step": _KEY, "time_s": _NUMBER},
     )
 

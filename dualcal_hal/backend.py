@@ -22,11 +22,13 @@ class Answer:
     """What came of a piece of work in a recorded run.
 
     result: gives it as plain JSON, or raises the error that it ended in; images_are_exact: whether the images that
-    are played back are the very same, so that what was worked out from them can be worked out anew.
+    are played back are the very same, so that what was worked out from them can be worked out anew; place: where it
+    is recorded.
     """
 
     result: Callable[[], Any]
     images_are_exact: bool
+    place: str = "the log"
 
 
 class Backend(ABC):

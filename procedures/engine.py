@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from dualcal_hal.backend import Answer
 from dualcal_hal.cell import Arm, Cell
 from dualcal_hal.errors import (
     ArmMoved,
@@ -174,7 +175,7 @@ class Engine:
             if answer is None or (work.of_image and answer.images_are_exact):
                 result = work.body()
             else:
-                result = _read_recorded(work, answer.result())
+                result = _read_recorded(work, answer)
         except DualcalError as error:
             self._recording.worked(work.what, work.asked, None, error)
             raise
@@ -270,12 +271,13 @@ class Engine:
             raise StopFailed(arms, "stop", reasons, "it may still move: use the emergency stop")
 
 
-def _read_recorded(work: Work, recorded: Any) -> Any:
+def _read_recorded(work: Work, answer: Answer) -> Any:
+    recorded = answer.result()
     try:
         return work.read(recorded)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         what = f"what was worked out as {work.what} cannot be read ({type(error).__name__}: {error})"
-        raise LogDamaged("the log", None, what) from error
+        raise LogDamaged(answer.place, None, what) from error
 
 
 def _reading_noise(encoder_sigma: float) -> float:

@@ -254,12 +254,13 @@ def test_records_of_any_content_with_right_checksums_are_read_or_refused(tmp_pat
 # Images
 
 
-def png(width, height, depth=8, colour=0, body=b""):
+def png(width, height, depth=8, colour=0, body=b"", interlaced=0, others=()):
     def block(kind, content):
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
-    header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + block(b"IHDR", header) + block(b"IDAT", zlib.compress(body)) + block(b"IEND", b"")
+    header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, interlaced)
+    blocks = [(b"IHDR", header), *others, (b"IDAT", zlib.compress(body, 9)), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(block(*each) for each in blocks)
 
 
 @pytest.mark.parametrize(
@@ -270,6 +271,13 @@ def png(width, height, depth=8, colour=0, body=b""):
         (png(0, 10), "too large, or empty"),
         (png(10, 10, depth=16), "no grey PNG"),
         (png(10, 10, colour=2), "no grey PNG"),
+        (png(10, 10, interlaced=1), "no grey PNG"),
+        (png(10, 10, others=[(b"zTXt", b"note\0\0" + zlib.compress(b"x" * 10_000))]), "a block b'zTXt'"),
+        (png(10, 10, others=[(b"IHDR", struct.pack(">IIBBBBB", 9, 9, 8, 0, 0, 0, 0))]), "a block b'IHDR'"),
+        (png(10, 10, others=[(b"IDAT", zlib.compress(bytes(110)))], body=b"x"), "goes on behind its end"),
+        (png(10, 10, body=bytes(109)), "fewer rows"),
+        (png(10, 10, body=bytes(111)), "more rows"),
+        (png(10, 10, others=[(b"IDAT", b"no zlib")]), "cannot be unpacked"),
         (png(10, 10)[:-5], "cut off"),
         (png(10, 10)[:30] + b"\0" + png(10, 10)[31:], "checksum"),
         (b"\x89PNG\r\n\x1a\n", "cut off"),
@@ -279,6 +287,26 @@ def png(width, height, depth=8, colour=0, body=b""):
 def test_an_image_that_asks_for_too_much_is_not_decoded(data, what):
     with pytest.raises(ValueError, match=what):
         images.decode(data, "png")
+
+
+def test_what_follows_the_last_row_is_not_unpacked(capfd):
+    """A few bytes may stand for a thousand times as many: what there is no room for must take no time either."""
+    import time
+
+    bomb = png(16, 16, body=bytes(1 << 29))
+    assert len(bomb) < 1 << 20
+    begun = time.process_time()
+    with pytest.raises(ValueError, match="more rows"):
+        images.decode(bomb, "png")
+    assert time.process_time() - begun < 0.1
+    assert capfd.readouterr().err == "", "the decoder's own words are nobody's"
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (20, 30), (601, 800)])
+def test_an_image_comes_back_to_the_last_bit(size):
+    image = np.random.default_rng(2).integers(0, 256, size, dtype=np.uint8)
+    assert np.array_equal(images.decode(images.encode(image, "png"), "png"), image)
+    assert images.decode(images.encode(image, "jpeg"), "jpeg").shape == size
 
 
 def test_an_image_of_an_unknown_format_is_not_decoded():
@@ -293,6 +321,56 @@ def test_a_jpeg_header_that_lies_is_not_decoded():
     data[place + 5 : place + 9] = b"\xff\xff\xff\xff"
     with pytest.raises(ValueError, match="too large"):
         images.decode(bytes(data), "jpeg")
+
+
+def jpeg():
+    """A small image as it is written here: everything before its frame's header, the header, and the rest."""
+    data = images.encode(np.zeros((16, 16), np.uint8), "jpeg")
+    place = data.index(b"\xff\xc0")
+    return data[:place], data[place : place + 13], data[place + 13 :]
+
+
+def sized(header, width, height):
+    return header[:5] + struct.pack(">HH", height, width) + header[9:]
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda before, header, after: before + b"\xff" + header + after, "ffff where a segment"),
+        (lambda before, header, after: before + b"\xff\x01" + header + after, "ff01 where a segment"),
+        (lambda before, header, after: before + b"\xff\xd0" + header + after, "ffd0 where a segment"),
+        (lambda before, header, after: before + b"\xff\xc2" + header[2:] + after, "ffc2 where a segment"),
+        (lambda before, header, after: before + header + sized(header, 9000, 7000) + after, "two sizes"),
+        (lambda before, header, after: before + header + after[:-2] + header + after, "more than one scan"),
+        (lambda before, header, after: before + header + after[:-2], "cut off"),
+        (lambda before, header, after: before + after, "no size"),
+        (lambda before, header, after: before + header[:9] + b"\x03" + header[10:] + after, "no grey JPEG"),
+        (lambda before, header, after: before + header[:4] + b"\x0c" + header[5:] + after, "no grey JPEG"),
+        (lambda before, header, after: before + header[:3] + b"\x01" + header[4:] + after, "cut off"),
+    ],
+)
+def test_a_jpeg_whose_size_could_be_taken_for_another_is_not_decoded(change, what):
+    """Bytes that a decoder passes over hide the header that it goes by from one that does not."""
+    with pytest.raises(ValueError, match=what):
+        images.decode(change(*jpeg()), "jpeg")
+
+
+def test_joint_states_have_an_end_before_they_are_taken_apart(path):
+    """Two bytes of an empty joint stand for a hundred in memory."""
+    for count, refused in ((6, False), (4_000_000, True)):
+        with path.open("wb") as file:
+            writer = Writer(file, compression=CompressionType.NONE, enable_data_crcs=True)
+            writer.start(PROFILE)
+            channels = Layout(("left",), "camera").channels()
+            numbers = {each.topic: writer.register_channel(each.topic, each.encoding, 0) for each in channels}
+            writer.add_message(numbers["/left/joint_states"], 0, b"\x12\x00" * count, 0)
+            writer.finish()
+        if refused:
+            with pytest.raises(LogDamaged, match="8000000 bytes are too many for the joints of an arm"):
+                read(path)
+        else:
+            assert len(read(path)[0][0].positions) == count
 
 
 @pytest.mark.parametrize("image_format", ["png", "jpeg"])

@@ -15,7 +15,8 @@ from dualcal_hal.errors import FormatError
 from dualcal_hal.session.captures import CellShape
 from dualcal_hal.session.journal import Journal
 from dualcal_hal.session.log import Call, Layout, LogReader, Note, Worked
-from dualcal_hal.session.log.records import from_json, to_json
+from dualcal_hal.session.log.layout import RECORD_KINDS
+from dualcal_hal.session.log.records import LONGEST_RECORD, from_json, to_json
 from dualcal_hal.session.plain import DEEPEST, Fields, parse
 from procedures.calibrate import Calibration, point_of
 from procedures.detection import Missed
@@ -234,3 +235,17 @@ def test_a_journalled_value_that_is_wrong_is_named_with_its_line(tmp_path):
     key = next(key for key, _ in journal.results() if key.kind == "point")
     with pytest.raises(FormatError, match=rf"journal\.jsonl:{number + 1}: .* servo is no finite number"):
         journal.read(key, lambda record: point_of(record, CellShape.of(load_cell(GOLDEN / "cell.yaml").cell)))
+
+
+def test_a_record_has_an_end():
+    longest = Worked(0, "x", "x" * (LONGEST_RECORD - 100), None, 0.0)
+    assert from_json(Worked, to_json(longest)) == longest
+    with pytest.raises(ValueError, match="bytes is not read"):
+        from_json(Worked, to_json(Worked(0, "x", "x" * LONGEST_RECORD, None, 0.0)))
+
+
+def test_every_record_of_a_run_is_far_from_its_end():
+    with LogReader(GOLDEN / "log-0001.mcap") as log:
+        assert (
+            max(len(message.data) for topic, message in log.messages() if topic in RECORD_KINDS) < LONGEST_RECORD / 100
+        )

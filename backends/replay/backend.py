@@ -97,7 +97,7 @@ class ReplayBackend(Backend):
         if differs is not None:
             raise ReplayMismatch.at(WORK, work.index, work.asked, asked, f"{what}: {differs}")
         timeline.take_work()
-        return Answer(lambda: _result(work), images_are_exact)
+        return Answer(lambda: _result(work), images_are_exact, f"{self._session}: work {work.index}")
 
     def procedure_ended(self) -> None:
         """ReplayMismatch for the first command or piece of work that the recorded run went on with."""

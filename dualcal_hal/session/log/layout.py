@@ -29,6 +29,9 @@ METADATA_NAME = "dualcal.log"
 LARGEST_RECORD = 1 << 26
 """Bytes of one record of the file, so of a message, a chunk or an attachment."""
 
+LARGEST_JOINT_STATES = 1 << 14
+"""Bytes of the states of an arm's joints, which may take a hundred times as many in memory; of six joints 200."""
+
 MOST_ARMS = 16
 """A log that names more is none."""
 

@@ -40,6 +40,7 @@ from dualcal_hal.session.log.framing import (
 from dualcal_hal.session.log.layout import (
     FORMAT_NAME,
     FORMAT_VERSION,
+    LARGEST_JOINT_STATES,
     METADATA_NAME,
     RECORD_KINDS,
     Layout,
@@ -338,6 +339,8 @@ def item_of(topic: str, message: Message, file: str) -> Item | None:
             when = message.publish_time
             return Picture(camera, message.sequence, image.format, image.data, when, file, message.offset)
         if (arm := arm_of(topic)) is not None:
+            if len(message.data) > LARGEST_JOINT_STATES:
+                raise ValueError(f"{len(message.data)} bytes are too many for the joints of an arm")
             states = foxglove.JointStates.FromString(message.data)
             positions = tuple(joint.position for joint in states.joints)
             velocities = tuple(joint.velocity for joint in states.joints)

@@ -18,8 +18,10 @@ from dualcal_hal.robot import JointPath, Joints, Mode, MotionState, RobotState, 
 from dualcal_hal.session.journal import StepKey
 from dualcal_hal.session.plain import SPECIAL, Fields, expect, number_in_text, parse
 
-LONGEST_RECORD = 1 << 24
-"""Bytes of JSON that are read as one record."""
+LONGEST_RECORD = 1 << 20
+"""Bytes of JSON that are read as one record, which may take thirty times as many in memory. A plan is the longest: of
+the paper's 28 + 14 positions it takes 14 kB.
+"""
 
 Level = Literal["debug", "info", "warning", "error"]
 

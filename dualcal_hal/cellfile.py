@@ -24,6 +24,7 @@ from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
 from dualcal_hal.config import CellConfig, CellDocument, Location, SimulationConfig, reference_problems
+from dualcal_hal.config.backends import BACKENDS_ARE_KNOWN
 from dualcal_hal.config.fixtures import FOLDER, MESHES_ARE_READ
 from dualcal_hal.errors import CellFileError, Problem
 
@@ -41,33 +42,58 @@ class CellFile:
     sha256: str
 
 
-def load_cell(path: Path, overrides: Sequence[str] = (), *, meshes: bool = True) -> CellFile:
+def load_cell(
+    path: Path,
+    overrides: Sequence[str] = (),
+    *,
+    meshes: bool = True,
+    backends: bool = True,
+    instead: Mapping[str, Any] | None = None,
+) -> CellFile:
     """Read and check a cell file, with ``overrides`` such as ``procedure.tolerance_px=0.01`` applied.
 
     ``meshes`` False leaves the files of meshes unread, where no arm is to move: a session has none of them.
+    ``backends`` False leaves the backends unchecked, where no device is used: they need not be installed. ``instead``
+    is an entry of ``backends`` through which all devices are reached in place of what the file says.
 
     An override is a path of keys and list indices, and a YAML scalar or flow value. Raises CellFileError
     with all problems found, each at ``FILE:LINE:COLUMN`` or ``--set PATH``.
     """
     text = _read(path)
     try:
-        return _load(path, text, overrides, {FOLDER: path.parent, MESHES_ARE_READ: meshes})
+        context = {FOLDER: path.parent, MESHES_ARE_READ: meshes, BACKENDS_ARE_KNOWN: backends}
+        return _load(path, text, overrides, context, instead)
     except RecursionError as error:
         raise CellFileError([Problem(str(path), "values are nested too deeply, in the file or with --set")]) from error
 
 
-def _load(path: Path, text: str, overrides: Sequence[str], context: Mapping[str, Any]) -> CellFile:
+def _load(
+    path: Path, text: str, overrides: Sequence[str], context: Mapping[str, Any], instead: Mapping[str, Any] | None
+) -> CellFile:
     source = _Source(str(path), text)
     document = source.document()
+    if instead is not None:
+        _reach_through(document, instead)
     _, as_written = _checked(document, context)
     settings, refused = _apply(document, overrides)
     checked, findings = _checked(document, context)
     problems = [*source.key_problems(), *source.cited(findings, as_written, settings)]
     if problems or refused or checked is None:
         raise CellFileError([problem for _, problem in sorted(problems, key=lambda p: p[0])] + refused)
-    if overrides:
+    if overrides or instead is not None:
         text = _dumped(document)
     return CellFile(checked.cell, checked.simulation, text, hashlib.sha256(text.encode()).hexdigest())
+
+
+def _reach_through(document: CommentedMap, entry: Mapping[str, Any]) -> None:
+    """Have all devices of the document be those of one backend; what is no device is left for the check to find."""
+    name = str(entry["type"])
+    document["backends"] = CommentedMap({name: CommentedMap(entry)})
+    robots = document.get("robots")
+    devices = [*(robots.values() if isinstance(robots, CommentedMap) else ()), document.get("camera")]
+    for device in devices:
+        if isinstance(device, CommentedMap):
+            device["backend"] = name
 
 
 def standing_alone(file: CellFile) -> tuple[str, dict[str, Path]]:

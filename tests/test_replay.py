@@ -256,6 +256,43 @@ def test_a_run_without_a_plan_fails_alike(tmp_path, monkeypatch):
     assert "It ended so: nothing will do" in result.output
 
 
+def of_another_backend(session, entry):
+    """As if it had been recorded on devices of which this program knows nothing."""
+    text = (session / "cell.yaml").read_text()
+    assert "{type: simulator}" in text
+    (session / "cell.yaml").write_text(text.replace("{type: simulator}", entry))
+
+
+@pytest.mark.parametrize("entry", ["{type: kuka, host: 10.0.0.1}", "{type: simulator, of_a_later_version: 3}"])
+def test_a_session_is_replayed_where_its_backend_is_not_known(session, entry):
+    of_another_backend(session, entry)
+    result = dualcal("replay", session)
+    assert result.exit_code == 0, result.output
+    assert "The result is the same to the last bit." in result.output
+    assert dualcal("run", session / "cell.yaml").exit_code == 2, "to run there is another matter"
+
+
+@pytest.mark.parametrize("redetect", [[], ["--redetect"]])
+def test_a_session_is_estimated_from_where_its_backend_is_not_known(session, redetect):
+    before = dualcal("estimate", session, "--json", *redetect)
+    of_another_backend(session, "{type: kuka, host: 10.0.0.1}")
+    result = dualcal("estimate", session, "--json", *redetect)
+    assert result.exit_code == 0, result.output
+    there, here = (json.loads(each.stdout)["transforms"] for each in (before, result))
+    assert here == there
+
+
+def test_a_cell_file_that_is_wrong_elsewhere_is_told_by_a_replay_with_its_line(session):
+    of_another_backend(session, "{type: kuka}")
+    text = (session / "cell.yaml").read_text()
+    (session / "cell.yaml").write_text(text.replace("tilt_max_deg: ", "tilt_max_deg: -"))
+    line = 1 + text[: text.index("tilt_max_deg: ")].count("\n")
+    result = dualcal("replay", session)
+    assert result.exit_code == 2
+    assert f"cell.yaml:{line}:" in result.output
+    assert "kuka" not in result.output
+
+
 # -- what is not the same ---------------------------------------------------------------------------
 
 

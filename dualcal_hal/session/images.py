@@ -166,7 +166,8 @@ def _png_block(kind: bytes, content: bytes) -> bytes:
 def _jpeg_size(data: bytes) -> tuple[int, int]:
     """Of a baseline image of one scan. What T.81 allows besides is refused: of it the decoder may make another size."""
     sizes, end = [], 0
-    for marker, content, end in _jpeg_segments(data):
+    for marker, content, following in _jpeg_segments(data):
+        end = following
         if marker == _JPEG_FRAME:
             sizes.append(_jpeg_frame_size(content))
     if len(sizes) != 1:

@@ -43,7 +43,7 @@ def estimate_captures(options: EstimateOptions) -> None:
     if not options.captures.exists():
         raise UsageError(f"{options.captures}: does not exist")
     _check_out(options)
-    file = load_cell(_cell_path(options), meshes=False)
+    file = load_cell(_cell_path(options), meshes=False, backends=False)
     captures, unfinished = _captures(options.captures, file)
     console = Console(stderr=options.json)
     if options.redetect:

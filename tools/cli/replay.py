@@ -98,13 +98,8 @@ def _load(session: Path) -> CellFile:
     if not path.is_file():
         raise UsageError(f"{session}: is no session: there is no cell.yaml in it")
     begun_segments(session)  # refused now, before anything is begun
-    cell = load_cell(path).cell
-    name = "replay"
-    while name in cell.backends:
-        name += "_"
-    entry = json.dumps({"type": "replay", "session": str(session.absolute())})
-    devices = [*(f"robots.{arm}" for arm in cell.robots), "camera"]
-    return load_cell(path, [f"backends.{name}={entry}", *(f"{device}.backend={name}" for device in devices)])
+    # Before anything is checked: what the devices were reached through need not be installed here.
+    return load_cell(path, instead={"type": "replay", "session": str(session.absolute())})
 
 
 class _PassingSession(Session):

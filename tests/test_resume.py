@@ -268,6 +268,32 @@ def test_a_journal_that_does_not_say_how_the_steps_left_the_cell_is_gone_on_with
     assert after["transforms"] == before["transforms"]
 
 
+@pytest.mark.parametrize("steps", [0, 2, 7])
+def test_a_session_whose_images_are_lost_goes_on(session, interrupted, steps):
+    folder = interrupted(steps)
+    shutil.rmtree(folder / "images")
+    result = dualcal("run", "--resume", folder)
+    assert result.exit_code == 0, result.output
+    assert came_to(folder) == came_to(session)
+    assert (folder / "images" / "verification-00-2.png").exists()
+
+
+@pytest.mark.parametrize("lost", ["images", "images/calibration-00-0.png", "plan.json"])
+def test_a_session_that_has_all_captured_is_concluded_without_the_part_of_the_picture_that_is_lost(
+    session, interrupted, lost, capfd
+):
+    folder = interrupted(steps_of(session))
+    shutil.rmtree(folder / lost) if (folder / lost).is_dir() else (folder / lost).unlink()
+    result = dualcal("run", "--resume", folder)
+    assert result.exit_code == 0, result.output
+    said = "plan.json: is missing; the picture" if lost == "plan.json" else "calibration-00-0.png: there is no readable"
+    assert [said in line for line in result.stdout.splitlines()].count(True) == 1
+    assert capfd.readouterr().err == ""
+    assert came_to(folder) == came_to(session)
+    assert (folder / "summary.png").exists()
+    assert "taken over" not in dualcal("run", "--resume", folder).stdout, "it is finished now"
+
+
 # -- where the arms stand --------------------------------------------------------------------------
 
 

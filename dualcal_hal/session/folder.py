@@ -7,12 +7,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
-
 from dualcal_hal.camera import Image
 from dualcal_hal.errors import FormatError, UsageError
 from dualcal_hal.session.files import read_document, read_object, write_atomically, write_document
-from dualcal_hal.session.images import encode_png
+from dualcal_hal.session.images import decode, encode_png
 from dualcal_hal.session.journal import Journal
 
 CELL_FILE = "cell.yaml"
@@ -47,6 +45,15 @@ class Session:
             raise UsageError(f"{folder}: cannot be written: {error.strerror}") from error
         return session
 
+    def go_on(self, now: str) -> None:
+        """Have all be there that a run writes into, also what was lost; ``now`` (ISO 8601) if nothing was begun."""
+        self._images.mkdir(exist_ok=True)
+        self.journal.begin(now)
+
+    @property
+    def _images(self) -> Path:
+        return self.folder / "images"
+
     @property
     def started(self) -> str | None:
         """When the run was begun first (ISO 8601), None if nothing tells."""
@@ -73,7 +80,7 @@ class Session:
 
     def image_path(self, name: str) -> Path:
         """Where the image of a capture or look is kept."""
-        return self.folder / "images" / f"{name.replace('/', '-')}.png"
+        return self._images / f"{name.replace('/', '-')}.png"
 
     def write_image(self, name: str, image: Image) -> None:
         """Store an image losslessly and durably."""
@@ -81,12 +88,12 @@ class Session:
 
     def read_image(self, name: str) -> Image:
         """An image as it was stored; UsageError if it is not there."""
-        import cv2
-
-        image = cv2.imread(str(self.image_path(name)), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise UsageError(f"{self.image_path(name)}: there is no readable image")
-        return image.astype(np.uint8, copy=False)
+        path = self.image_path(name)
+        try:
+            return decode(path.read_bytes(), "png")
+        except (OSError, ValueError) as error:
+            why = error.strerror if isinstance(error, OSError) else error
+            raise UsageError(f"{path}: there is no readable image: {why}") from error
 
     def read_document(self, file_name: str, expected_format: str) -> dict[str, Any]:
         """A JSON document of the session; FormatError if it is none of that format."""

@@ -22,6 +22,8 @@ _JPEG_QUALITY = 95
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_BLOCK = struct.Struct(">I4s")
 _PNG_HEADER = struct.Struct(">IIBBBBB")
+_PNG_ANCILLARY = 0x20
+"""Bit of the first letter of a block's kind: it may be passed over, and here it is."""
 _PNG_GREY = [8, 0, 0, 0, 0]
 """Bits, colour, compression, filter and interlacing of the images here."""
 
@@ -103,8 +105,8 @@ def _png_size(data: bytes) -> tuple[int, int]:
             if kind != b"IHDR" or len(content) != _PNG_HEADER.size:
                 raise ValueError("the PNG image has no header")
             header = _PNG_HEADER.unpack(content)
-        elif kind not in (b"IDAT", b"IEND"):
-            raise ValueError(f"the PNG image has a block {bytes(kind)!r}, which no image here needs")
+        elif kind not in (b"IDAT", b"IEND") and not kind[0] & _PNG_ANCILLARY:
+            raise ValueError(f"the PNG image has a block {bytes(kind)!r}, which no grey image needs")
     assert header is not None  # the blocks end with the last one, which is no header
     width, height, *form = header
     if form != _PNG_GREY:

@@ -28,7 +28,7 @@ def draw_frame(
     place: SubplotSpec,
     cell: CellConfig,
     captures: Sequence[CaptureRecord],
-    image: Image,
+    image: Image | None,
     shown: CaptureRecord,
 ) -> None:
     """The frame of the capture ``shown`` about the optical axis, and beside it how far each capture is from it."""
@@ -47,12 +47,13 @@ def draw_frame(
     head(panel, f"Camera frame: offset ({du:+.3f}, {dv:+.3f}) px")
 
 
-def _draw_board(axes: Axes, image: Image, shown: CaptureRecord, centre: Array) -> None:
+def _draw_board(axes: Axes, image: Image | None, shown: CaptureRecord, centre: Array) -> None:
     corners = np.array([corner for corner in shown.corners or () if corner] or [shown.feature]) - centre
     half = max(_SMALLEST_VIEW, _AROUND_CORNERS * float(np.abs(corners).max()))
-    height, width = image.shape
-    left, top = -0.5 - centre
-    axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(left, left + width, top + height, top))
+    if image is not None:
+        height, width = image.shape
+        left, top = -0.5 - centre
+        axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(left, left + width, top + height, top))
     axes.plot(*corners.T, ".", color=BLUE, markersize=6)
     _draw_circles(axes, shown.feature - centre, half)
     label(axes, f"u, px   (capture {shown.id})", "v, px")

@@ -37,13 +37,13 @@ def draw_summary(
     plan: Plan | None,
     captures: Captures,
     result: Result,
-    image: Image,
+    image: Image | None,
     feature_px: Sequence[float],
 ) -> None:
     """Write the picture of a run as a PNG of ``SIZE_PX``, all of it or nothing.
 
     plan: None where there was none, as for captures from elsewhere; image: (height, width), what the camera saw at
-    one of the captures; feature_px: (2,) where that capture has its feature point, px.
+    one of the captures, None where that is lost; feature_px: (2,) where that capture has its feature point, px.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -59,7 +59,7 @@ def summary_figure(
     plan: Plan | None,
     captures: Captures,
     result: Result,
-    image: Image,
+    image: Image | None,
     feature_px: Sequence[float],
 ) -> Figure:
     """The figure that :func:`draw_summary` writes, from the same parameters."""

@@ -13,12 +13,13 @@ from pathlib import Path
 import typer
 from rich.console import Console
 
+from dualcal_hal.camera import Image
 from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import CellFile, differences, load_cell, standing_alone
 from dualcal_hal.clock import utc_now
 from dualcal_hal.config import CellConfig
 from dualcal_hal.errors import FormatError, Problem, UsageError
-from dualcal_hal.session.captures import Captures, CellShape, write_captures
+from dualcal_hal.session.captures import CaptureRecord, Captures, CellShape, write_captures
 from dualcal_hal.session.distances import DISTANCES, Distances, read_distances
 from dualcal_hal.session.folder import CELL_FILE, Session
 from dualcal_hal.session.lock import SessionLock
@@ -98,14 +99,14 @@ def _resume(console: Console, options: RunOptions, folder: Path) -> int:
         if lock.left_by is not None:
             _say(console, f"{folder}: taken over from {lock.left_by}, which has ended without giving it back")
         session = Session(folder)  # as it is now that nobody else writes it
-        session.journal.begin(utc_now().isoformat(timespec="seconds"))
+        session.go_on(utc_now().isoformat(timespec="seconds"))
         with _kept(session):
             steps = session.journal.results()
             _say(console, f"going on with {folder}: {len(steps)} steps are finished")
             if is_complete(captures := _captures(file, session), file.cell.procedure):
                 _say(console, "all is captured already: only the analysis is left, and no arm is moved")
                 write_captures(session.captures_path, captures)
-                result = conclude(file, session, captures)
+                result = conclude(file, session, captures, lambda line: _say(console, line))
             else:
                 model = CellModel(file.cell)
                 calibration, cell = Calibration(file.cell, model), Cell(file)
@@ -141,7 +142,7 @@ def _finish(
     with _recording(options, session, file, cell) as recording:
         cell.record(recording)
         captures = _run(console, file, cell, calibration, session)
-        result = conclude(file, session, captures)
+        result = conclude(file, session, captures, lambda line: _say(console, line))
         recording.document(session.result_path.name, result.to_document())
     return result
 
@@ -283,20 +284,38 @@ def _write_documents(cell: Cell, session: Session, earlier: Distances | None) ->
             session.write_document(name, document)
 
 
-def conclude(file: CellFile, session: Session, captures: Captures) -> Result:
-    """Analyse, and only then compare with the truth where there is one; write both and the picture."""
+def conclude(
+    file: CellFile, session: Session, captures: Captures, say: Callable[[str], None] = lambda line: None
+) -> Result:
+    """Analyse, and only then compare with the truth where there is one; write both and the picture.
+
+    ``say`` gets a line for each part of the picture that cannot be drawn, as a file of the session is missing.
+    """
     result = analyse_session(file, session, captures)
     shown = captures.captures[0]
+    image, plan = _image_of(session, shown, say), None
+    if (session.folder / PLAN_FILE).exists():
+        plan = _read_plan(session, file.cell)
+    else:
+        say(f"{session.folder / PLAN_FILE}: is missing; the picture does without the plan")
     draw_summary(
         session.summary_path,
         cell=file.cell,
-        plan=_read_plan(session, file.cell),
+        plan=plan,
         captures=captures,
         result=result,
-        image=session.read_image(shown.id),
+        image=image,
         feature_px=shown.feature,
     )
     return result
+
+
+def _image_of(session: Session, shown: CaptureRecord, say: Callable[[str], None]) -> Image | None:
+    try:
+        return session.read_image(shown.id)
+    except UsageError as error:
+        say(f"{error}; the picture does without what the camera saw")
+        return None
 
 
 def _read_plan(session: Session, cell: CellConfig) -> Plan:

@@ -19,6 +19,7 @@ from procedures.analysis import analyse
 from procedures.calibrate import captures_of, finished
 from procedures.redetection import detect_anew
 from tools.cli.show import show_result
+from tools.cli.terminal import Screen
 from tools.cli.truth import simulated_truth
 
 SOURCES = ("captures.json", "cell.yaml", "journal.jsonl", "plan.json")
@@ -45,7 +46,7 @@ def estimate_captures(options: EstimateOptions) -> None:
     _check_out(options)
     file = load_cell(_cell_path(options), meshes=False, backends=False)
     captures, unfinished = _captures(options.captures, file)
-    console = Console(stderr=options.json)
+    console = Screen(stderr=options.json)
     if options.redetect:
         captures, unseen = _detected_anew(console, options.captures, captures, file.cell)
         unfinished = (*unfinished, *unseen)

@@ -137,7 +137,9 @@ def _silence_output() -> None:
 
 
 def _end(error: BaseException, message: str, code: int) -> None:
+    from tools.cli.terminal import plain
+
     with suppress(OSError, ValueError):  # where nobody reads it the exit code still tells
-        for line in (*message.splitlines(), *getattr(error, "__notes__", ())):
-            print(f"dualcal: {line}", file=sys.stderr)
+        for line in "\n".join((message, *getattr(error, "__notes__", ()))).split("\n"):
+            print(f"dualcal: {plain(line)}", file=sys.stderr)
     raise SystemExit(code if _received is None else INTERRUPTED) from error

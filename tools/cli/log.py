@@ -12,7 +12,6 @@ from typing import Any
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from dualcal_hal.errors import LogDamaged, LogNotWritten, UsageError
@@ -21,6 +20,7 @@ from dualcal_hal.session.log.export import export_log
 from dualcal_hal.session.log.info import Info, Topic, log_info
 from dualcal_hal.session.log.reader import segment_paths
 from dualcal_hal.session.log.recover import Recovered, recover_log
+from tools.cli.terminal import Screen
 
 GOOD, DAMAGED = 0, 1
 WIDTH = 80
@@ -103,7 +103,7 @@ def export(session: Path, out: Path | None, *, as_json: bool) -> int:
     else:
         table = _table("Exported", "rows")
         for arm, rows in exported.joint_states.items():
-            table.add_row(_plain(f"joint states of {arm}"), str(rows))
+            table.add_row(f"joint states of {arm}", str(rows))
         table.add_row("steps", str(exported.steps))
         table.add_row("frames", str(exported.frames))
         _console().print(table)
@@ -172,17 +172,12 @@ def _print_json(document: object, as_json: bool) -> None:
 
 
 def _console() -> Console:
-    return Console(width=WIDTH)
+    return Screen(width=WIDTH)
 
 
 def _say(text: str) -> None:
     """A sentence, unbroken: a path in it is to be copied."""
-    _console().print(_plain(text), soft_wrap=True, highlight=False)
-
-
-def _plain(text: str) -> str:
-    """Text that may come from a log, without what a terminal or rich would take for a command."""
-    return escape("".join(letter if letter.isprintable() else "?" for letter in text))
+    _console().print(text, soft_wrap=True, highlight=False)
 
 
 def _table(*columns: str) -> Table:
@@ -199,7 +194,7 @@ def _print_info(console: Console, info: Info) -> None:
     for topic in info.topics:
         rate = "" if topic.rate is None else f"{topic.rate:.1f}"
         gap = ("", "") if topic.count < 2 else (f"{topic.gap / 1e9:.2f}", f"{_after(info, topic):.1f}")
-        table.add_row(_plain(topic.name), str(topic.count), rate, *gap)
+        table.add_row(topic.name, str(topic.count), rate, *gap)
     console.print(table)
     if info.attachments:
         _say(f"attached: {', '.join(info.attachments)}")
@@ -247,7 +242,7 @@ def _print_list(console: Console, rows: Sequence[tuple[str, str, str]], columns:
         return
     table = Table(*columns, box=None, pad_edge=False)
     for row in rows[:_FINDINGS_SHOWN]:
-        table.add_row(*map(_plain, row))
+        table.add_row(*row)
     console.print(table)
     if len(rows) > _FINDINGS_SHOWN:
         console.print(f"and {len(rows) - _FINDINGS_SHOWN} more; --json lists all")

@@ -28,7 +28,7 @@ class Lines:
         pass
 
     def __call__(self, event: object) -> None:
-        self._console.print(str(event), markup=False, highlight=False, soft_wrap=True)
+        self._console.print(str(event), highlight=False, soft_wrap=True)
 
 
 class Bars:
@@ -36,11 +36,13 @@ class Bars:
 
     def __init__(self, console: Console) -> None:
         self._bars = Progress(
-            TextColumn("{task.description:<12}", table_column=Column(no_wrap=True, min_width=12)),
+            TextColumn("{task.description:<12}", markup=False, table_column=Column(no_wrap=True, min_width=12)),
             BarColumn(bar_width=12),
             MofNCompleteColumn(table_column=Column(no_wrap=True, min_width=5)),
             TimeElapsedColumn(table_column=Column(no_wrap=True, min_width=7)),
-            TextColumn("{task.fields[latest]}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)),
+            TextColumn(
+                "{task.fields[latest]}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)
+            ),
             console=console,
             expand=True,
         )
@@ -71,7 +73,7 @@ class Bars:
             case BeliefRefined():
                 pass  # on a terminal the bars say enough
             case _:
-                self._bars.console.print(str(event), markup=False, highlight=False)
+                self._bars.console.print(str(event), highlight=False)
 
     def _task(self, name: str, total: int) -> TaskID:
         if name not in self._tasks:

@@ -37,6 +37,7 @@ from procedures.calibrate import Calibration, captures_of
 from procedures.planning.model import CellModel
 from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.run import analyse_session, execute, write_session_captures
+from tools.cli.terminal import Screen
 
 _NO_END_OF_A_RUN = (ReplayMismatch, FrameMissing, LogDamaged, Interrupted)
 """Errors that say that the replay failed, and not that the recorded run ended so."""
@@ -82,7 +83,7 @@ class Replayed:
 def replay_session(options: ReplayOptions) -> int:
     """Play a session back and compare; 0 if it came to the same."""
     file = _load(options.session)
-    console = Console(stderr=options.json)
+    console = Screen(stderr=options.json)
     with _session(options.out, file.text) as session:
         replayed = _replay(options.session, file, session)
     if options.json:
@@ -203,7 +204,7 @@ def _document(replayed: Replayed) -> dict[str, object]:
 
 def _show(console: Console, replayed: Replayed) -> None:
     def say(text: str) -> None:
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        console.print(text, highlight=False, soft_wrap=True)
 
     faster = replayed.recorded_time / replayed.time
     say(f"{replayed.recorded_time:.0f} s of recorded time in {replayed.time:.1f} s, {faster:.0f} times as fast")

@@ -38,6 +38,7 @@ from procedures.report import draw_plan, draw_summary
 from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.progress import progress
 from tools.cli.show import show_rehearsal, show_result
+from tools.cli.terminal import Screen, plain
 from tools.cli.truth import simulated_truth
 
 PLAN_FILE = "plan.json"
@@ -62,7 +63,7 @@ class RunOptions:
 def run_cell(options: RunOptions) -> int:
     """Prepare, run, analyse; returns the exit code."""
     # With --json standard output is for the result alone.
-    console = Console(stderr=options.json)
+    console = Screen(stderr=options.json)
     if options.resume is not None:
         return _resume(console, options, options.resume)
     if options.cell is None:
@@ -158,7 +159,7 @@ def go_on_from_journal(cell: Cell, session: Session) -> None:
 
 def _report(console: Console, options: RunOptions, file: CellFile, session: Session, result: Result) -> int:
     if options.json:
-        typer.echo(session.result_path.read_text(), nl=False)
+        typer.echo(plain(session.result_path.read_text()), nl=False)
     else:
         show_result(console, file.cell, result, simulated_truth(file), as_json=False)
     if (distances := read_distances(session)) is not None:
@@ -168,7 +169,7 @@ def _report(console: Console, options: RunOptions, file: CellFile, session: Sess
 
 
 def _say(console: Console, line: str) -> None:
-    console.print(line, markup=False, soft_wrap=True, highlight=False)
+    console.print(line, soft_wrap=True, highlight=False)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
+from dualcal_hal.camera import Frame
 from dualcal_hal.errors import LogDamaged, LogNotWritten, LogTooNew
 from dualcal_hal.robot import Mode, MotionState, RobotState
 from dualcal_hal.session.log import (
@@ -183,8 +184,45 @@ def test_a_damaged_chunk_costs_its_messages_and_is_listed(path, tmp_path):
     found = items(tmp_path / "new.mcap")
     assert 0 < len(whole) - len(found) < 15
     assert [item for item in whole if item in found] == found
-    assert recovered.missing["/dualcal/calls"] == 2
+    assert recovered.missing == {
+        "/camera/annotations": 1,
+        "/camera/image": 1,
+        "/dualcal/calls": 2,
+        "/dualcal/motions": 1,
+        "/dualcal/replies": 2,
+        "/dualcal/steps/begun": 1,
+        "/dualcal/steps/finished": 1,
+        "/dualcal/work": 1,
+        "/left/joint_states": 1,
+        "/tf": 1,
+    }
     assert path.read_bytes() == before
+
+
+def test_what_a_chunk_had_is_told_by_the_summary_alone_too(path, tmp_path):
+    """Its head and the indexes behind it are lost with it."""
+    first, second = chunks(path)[2:4]
+    data = path.read_bytes()
+    path.write_bytes(data[: first.offset] + b"\xff" * (second.offset - first.offset) + data[second.offset :])
+    recovered = recover_log(path, tmp_path / "new.mcap")
+    assert (recovered.missing["/camera/image"], recovered.missing["/left/joint_states"]) == (1, 1)
+
+
+def test_an_image_that_is_lost_is_told_by_the_reply_that_speaks_of_it(path, tmp_path):
+    """In a file that was never finished, and of which the chunk with the image alone is lost."""
+    image = Frame(np.zeros((8, 8), np.uint8), 0.5, 7)
+    path.unlink()
+    with LogWriter(path, STARTED, arms=("left",)) as log:
+        log.record(Call("camera", 0, "grab", {}, 0.0))
+        log.sync()
+        log.frame(image)
+        log.sync()
+        log.record(Reply("camera", 0, FrameRef("camera", 7, 0.5), 0.6))
+        log.sync()
+    lost, behind = chunks(path)[-2:]
+    data = path.read_bytes()
+    path.write_bytes(data[: lost.offset] + b"\xff" * (behind.offset - lost.offset) + data[behind.offset : behind.end])
+    assert recover_log(path, tmp_path / "new.mcap").missing == {"/camera/image": 1}
 
 
 def test_behind_bytes_that_make_no_sense_the_way_on_is_found(path, tmp_path):
@@ -396,7 +434,20 @@ def test_recover_writes_beside_what_it_reads_and_lists_what_is_lost(path):
     assert done.exit_code == 0
     assert (path.parent / "recovered-log-0001.mcap").exists()
     assert "missing on /dualcal/calls: 2" in done.stdout
+    assert "missing on /camera/image: 1" in done.stdout
     assert call("check", path.parent / "recovered-log-0001.mcap").exit_code == 1, "what is missing stays missing"
+
+
+def test_a_second_recovery_says_what_to_do(path):
+    path.write_bytes(path.read_bytes()[:-100])
+    assert call("recover", path.parent).exit_code == 0
+    before = (path.parent / "recovered-log-0001.mcap").read_bytes()
+    again = call("recover", path.parent)
+    assert again.exit_code == 2
+    assert "recovered-log-0001.mcap: File exists: it was recovered before? Name another" in again.stderr
+    assert (path.parent / "recovered-log-0001.mcap").read_bytes() == before
+    (path.parent / "other").mkdir()
+    assert call("recover", path.parent, "--out", path.parent / "other").exit_code == 0
 
 
 def test_what_a_log_holds_is_no_command_for_the_terminal(tmp_path):

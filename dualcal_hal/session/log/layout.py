@@ -29,6 +29,9 @@ METADATA_NAME = "dualcal.log"
 LARGEST_RECORD = 1 << 26
 """Bytes of one record of the file, so of a message, a chunk or an attachment."""
 
+SEQUENCES = 1 << 32
+"""A message's number in the file is that of its image or state modulo this."""
+
 LARGEST_JOINT_STATES = 1 << 14
 """Bytes of the states of an arm's joints, which may take a hundred times as many in memory; of six joints 200."""
 

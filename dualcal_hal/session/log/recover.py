@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -17,18 +17,29 @@ from dualcal_hal.session.log.framing import (
     Damage,
     Malformed,
     Message,
+    MessageIndex,
     Metadata,
     Opcode,
     Piece,
     RawFile,
+    Statistics,
     chunk_records,
     cut_chunk_records,
     parse,
     parse_attachment,
     records_in,
 )
-from dualcal_hal.session.log.layout import METADATA_NAME, PROFILE, Layout
+from dualcal_hal.session.log.layout import (
+    METADATA_NAME,
+    PROFILE,
+    RECORD_TOPICS,
+    SEQUENCES,
+    Layout,
+    camera_of,
+    image_topic,
+)
 from dualcal_hal.session.log.reader import LogReader, item_of
+from dualcal_hal.session.log.records import FrameRef, Reply, from_json
 from dualcal_hal.session.log.writer import FileWriter
 
 _MOST_TOPICS = 1000
@@ -46,7 +57,8 @@ class Loss:
 @dataclass(frozen=True)
 class Recovered:
     """The new file, how many messages it has by topic, and what was lost. ``missing``: messages by topic that were
-    there, to judge by their numbers.
+    there, as far as the file tells: by its summary, the indexes behind its chunks, the messages' own numbers, and
+    replies that speak of an image.
     """
 
     path: Path
@@ -78,7 +90,7 @@ def _recover(raw: RawFile, source: Path, target: Path) -> Recovered:
         writer = FileWriter(file, layout)
         rescue.copy(writer, source.name)
         writer.finish()
-    return Recovered(target, dict(rescue.counts), tuple(rescue.losses), dict(rescue.missing))
+    return Recovered(target, dict(rescue.counts), tuple(rescue.losses), rescue.missing)
 
 
 @contextmanager
@@ -91,6 +103,9 @@ def _created(target: Path) -> Iterator[IO[bytes]]:
             except BaseException:
                 target.unlink()
                 raise
+    except FileExistsError as error:
+        advice = "it was recovered before? Name another folder with --out, or move it away"
+        raise LogNotWritten(f"{target}: {error.strerror}: {advice}") from error
     except OSError as error:
         raise LogNotWritten(f"{target}: the log cannot be written: {error.strerror}") from error
 
@@ -105,10 +120,24 @@ class _Rescue:
         self._counted = frozenset(topic for topic in self._known if topic.startswith("/dualcal/"))
         self._about: dict[str, str] | None = None
         self._due: Counter[str] = Counter()
+        self._skipped: Counter[str] = Counter()
+        self._indexed: Counter[int] = Counter()
+        self._summed: Counter[int] = Counter()
+        self._pictures: dict[str, int] = {}
         self.counts: Counter[str] = Counter()
-        self.missing: Counter[str] = Counter()
         self.losses: list[Loss] = []
         self._layout = layout
+
+    @property
+    def missing(self) -> dict[str, int]:
+        """Messages by topic that the file had and that are not saved."""
+        missing = dict(self._skipped)
+        for there in (self._indexed, self._summed):
+            for channel, count in there.items():
+                topic = self._topics.get(channel)
+                if topic in self._known:
+                    missing[topic] = max(missing.get(topic, 0), count - self.counts[topic])
+        return {topic: count for topic, count in missing.items() if count > 0}
 
     def copy(self, writer: FileWriter, source: str) -> None:
         """All that can be read, in its order."""
@@ -151,6 +180,11 @@ class _Rescue:
             case Piece(offset, Opcode.ATTACHMENT):
                 kept = parse_attachment(self._raw.content(piece), offset)
                 writer.write_attachment(kept.name, kept.media_type, kept.data, kept.log_time)
+            case Piece(offset, Opcode.MESSAGE_INDEX):
+                index = parse(MessageIndex, self._raw.content(piece), offset)
+                self._indexed[index.channel_id] += len(index.records)
+            case Piece(offset, Opcode.STATISTICS):
+                self._summed.update(parse(Statistics, self._raw.content(piece), offset).channel_message_counts)
 
     def _write_about(self, writer: FileWriter, content: dict[str, str], source: str) -> None:
         if self._about is None:
@@ -184,10 +218,22 @@ class _Rescue:
             if unchecked:
                 self._require_readable(topic, record)
             if topic in self._counted:
-                self.missing[topic] += max(0, record.sequence - self._due[topic])
+                self._skipped[topic] += max(0, record.sequence - self._due[topic])
                 self._due[topic] = record.sequence + 1
             self.counts[topic] += 1
+            self._follow_pictures(topic, record)
             writer.write(topic, record.publish_time, record.data, record.sequence)
+
+    def _follow_pictures(self, topic: str, message: Message) -> None:
+        """An image comes before the reply that speaks of it."""
+        if (camera := camera_of(topic)) is not None:
+            self._pictures[camera] = message.sequence
+        elif topic == RECORD_TOPICS[Reply] and b'"frame"' in message.data:
+            with suppress(ValueError):  # it is saved as it is: check tells what is wrong with it
+                reply = from_json(Reply, message.data)
+                frame = reply.value if isinstance(reply, Reply) else None
+                if isinstance(frame, FrameRef) and self._pictures.get(frame.camera) != frame.sequence % SEQUENCES:
+                    self._skipped[image_topic(frame.camera)] += 1
 
 
 def _layout(raw: RawFile) -> Layout | None:

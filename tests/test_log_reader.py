@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import shutil
 import struct
 import zlib
 from contextlib import suppress
@@ -19,7 +20,10 @@ from dualcal_hal.session import images
 from dualcal_hal.session.log import LogReader, Note, Picture, SessionLog, next_segment, segment_paths
 from dualcal_hal.session.log.framing import MAGIC
 from dualcal_hal.session.log.layout import PROFILE, Layout
-from tools.benchmarks.mutated_logs import mutate, read_all, write_sample
+from tools.benchmarks.mutated_logs import Rewriter, is_replayed, mutate, read_all, replay, write_sample
+from tools.golden import GOLDEN
+
+REPLAYED_TO = ("LogDamaged", "LogEnded", "ReplayMismatch", "FrameMissing", "CommandRefused", "DeviceError", "NoPlan")
 
 
 @pytest.fixture(scope="module")
@@ -220,13 +224,43 @@ def test_a_long_log_takes_no_more_memory_than_a_short_one(tmp_path):
 # Mutations: 2,000 in all
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_a_log_with_random_damage_is_read_or_refused_with_a_typed_error(tmp_path, sample, seed, monkeypatch):
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    path = tmp_path_factory.mktemp("small") / "log-0001.mcap"
+    write_sample(path, points=2)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_log_with_random_damage_is_read_or_refused_with_a_typed_error(tmp_path, small, seed, monkeypatch):
     monkeypatch.setattr("os.fsync", lambda _: None)
     chance = random.Random(seed)
-    for _ in range(95):
-        (tmp_path / "log.mcap").write_bytes(mutate(sample, chance))
-        read_all(tmp_path / "log.mcap", tmp_path / "recovered.mcap")
+    for _ in range(120):
+        (tmp_path / "log.mcap").write_bytes(mutate(small, chance))
+        read_all(tmp_path / "log.mcap", tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_log_with_other_records_and_right_checksums_is_read_or_refused(tmp_path, small, seed, monkeypatch):
+    monkeypatch.setattr("os.fsync", lambda _: None)
+    (tmp_path / "sample.mcap").write_bytes(small)
+    rewriter, chance, outcomes = Rewriter(tmp_path / "sample.mcap"), random.Random(seed), set()
+    for _ in range(70):
+        rewriter.write(tmp_path / "log.mcap", chance)
+        outcomes.add(read_all(tmp_path / "log.mcap", tmp_path))
+    assert outcomes == {"read", "LogDamaged"}
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_session_with_other_records_is_replayed_or_refused(tmp_path, seed, monkeypatch):
+    monkeypatch.setattr("os.fsync", lambda _: None)
+    session = shutil.copytree(GOLDEN, tmp_path / "session")
+    rewriter, chance = Rewriter(GOLDEN / "log-0001.mcap", is_replayed), random.Random(seed)
+    outcomes = set()
+    for _ in range(5):
+        rewriter.write(session / "log-0001.mcap", chance)
+        outcomes.add(replay(session))
+    assert outcomes <= {"replay 0", "replay 1", *(f"replay {each}" for each in REPLAYED_TO)}
 
 
 @settings(max_examples=100, deadline=None)
@@ -248,7 +282,7 @@ def test_records_of_any_content_with_right_checksums_are_read_or_refused(tmp_pat
             channel = data.draw(st.sampled_from(channels))
             writer.add_message(channel.number, 0, content, 0)
         writer.finish()
-    read_all(path, path.with_name("recovered.mcap"))
+    read_all(path, path.parent)
 
 
 # Images

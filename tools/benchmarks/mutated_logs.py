@@ -1,22 +1,32 @@
 """Logs with random damage: whatever was done to a log, reading it gives records or one of the typed errors.
 
+By bytes, which checksums find, and by records with the checksums made right again, which only their readers find. Each
+is read, counted, checked, recovered and exported, and of some sessions the replay is run.
+
 python -m tools.benchmarks.mutated_logs --count 100000
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import random
 import resource
+import shutil
 import tempfile
 from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from copy import deepcopy
 from datetime import UTC, datetime
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dualcal_hal.camera import Frame, Intrinsics
-from dualcal_hal.errors import LogDamaged, LogMissing, LogTooNew
+from dualcal_hal.errors import DualcalError, LogDamaged, LogMissing, LogTooNew
 from dualcal_hal.robot import JointPath, Mode, MotionState, RobotState
 from dualcal_hal.session.journal import StepKey
 from dualcal_hal.session.log import (
@@ -33,8 +43,12 @@ from dualcal_hal.session.log import (
     Worked,
 )
 from dualcal_hal.session.log.check import check_log
+from dualcal_hal.session.log.export import export_log
 from dualcal_hal.session.log.info import log_info
+from dualcal_hal.session.log.layout import METADATA_NAME, RECORD_KINDS, camera_of
 from dualcal_hal.session.log.recover import recover_log
+from dualcal_hal.session.log.writer import FileWriter
+from tools.golden import GOLDEN
 
 STARTED = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 TYPED = (LogDamaged, LogMissing, LogTooNew)
@@ -97,12 +111,85 @@ def mutate(content: bytes, chance: random.Random) -> bytes:
     return bytes(data)
 
 
-def read_all(path: Path, recovered: Path) -> str:
+class Rewriter:
+    """A log that is written again with some of its records changed: what checksums vouch for may still be anything."""
+
+    def __init__(self, source: Path, wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        """Keeps the messages of the wanted topics in memory."""
+        with LogReader(source) as reader:
+            self._layout, self._about = reader.layout(), dict(reader.about())
+            self._messages = [(topic, message) for topic, message in reader.messages() if wanted(topic)]
+
+    def write(self, target: Path, chance: random.Random) -> None:
+        """With one to three records changed, and all checksums right."""
+        changed = set(chance.sample(range(len(self._messages)), chance.randint(1, 3)))
+        about = self._about if chance.random() < 0.9 else {**self._about, "devices": chance.choice(_DEVICES)}
+        with target.open("wb") as file:
+            writer = FileWriter(file, self._layout)
+            writer.write_metadata(METADATA_NAME, about)
+            for number, (topic, message) in enumerate(self._messages):
+                data, when, sequence = message.data, message.publish_time, message.sequence
+                if number in changed:
+                    data = mutate_record(data, chance) if topic in RECORD_KINDS else mutate(data, chance)
+                    if chance.random() < 0.1:
+                        when, sequence = chance.choice((0, 1 << 62, (1 << 64) - 1)), chance.randrange(1 << 32)
+                writer.write(topic, when, data, sequence)
+            writer.finish()
+
+
+def mutate_record(data: bytes, chance: random.Random) -> bytes:
+    """A record's JSON with one of its values another, missing, or of another kind; now and then with bytes damaged."""
+    if chance.random() < 0.15:
+        return mutate(data, chance)
+    record = json.loads(data)
+    path = chance.choice(list(_places(record, ())))
+    value = deepcopy(chance.choice(_ODD))
+    if not path:
+        return json.dumps(value).encode()
+    holder = record
+    for key in path[:-1]:
+        holder = holder[key]
+    match chance.randrange(8):
+        case 0:
+            del holder[path[-1]]
+        case 1 if isinstance(holder, list):
+            holder[path[-1] : path[-1] + 1] = holder[path[-1] : path[-1] + 1] * chance.choice((2, 1000))
+        case _:
+            holder[path[-1]] = value
+    return json.dumps(record).encode()
+
+
+def _places(value: Any, path: tuple[Any, ...]) -> Iterator[tuple[Any, ...]]:
+    yield path
+    entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, below in entries:
+        yield from _places(below, (*path, key))
+
+
+_DEEP: Any = 0
+for _ in range(100):
+    _DEEP = [_DEEP]
+
+_ODD: tuple[Any, ...] = (
+    *(None, True, -1, 0, 1.5, 2**63, 10**30, 10**400, 1e308, -1e308, float("nan"), float("inf")),
+    *("", "nan", "inf", "\ud800", "\x00", "\x1b[31m", "a" * 300, "../../x", "left", "start", "DeviceError"),
+    *([], {}, [[]], [0.0], _DEEP, {"number": "nan"}, {"state": {}}, {"path": {}}, {"stop": {"confirmed": 1}}),
+    {"frame": {"camera": "camera", "sequence": 10**30, "time_s": "inf"}},
+    {"class": "DeviceError", "device": "left", "attempted": "x", "why": "\ud800", "advice": ""},
+)
+_DEVICES = (
+    *("", "[]", '{"arms": [], "camera": ""}', '{"arms": ["left"], "camera": "camera"}'),
+    *('{"arms": ["\\ud800"], "camera": "c"}', json.dumps({"arms": ["x" * 5000], "camera": "c"})),
+    '{"arms": ["left", "left"], "camera": "../../x"}',
+)
+
+
+def read_all(path: Path, folder: Path) -> str:
     """Read a log in every way there is; the name of the typed error that it ends with, or what it is. All else
-    goes through.
+    goes through. ``folder`` takes what is recovered and exported, and is emptied for that.
     """
     outcome = "read"
-    for way in (_items, log_info, check_log, lambda path: _recover(path, recovered)):
+    for way in (_items, log_info, check_log, lambda path: _recover(path, folder), lambda path: _export(path, folder)):
         try:
             way(path)
         except TYPED as error:
@@ -123,34 +210,73 @@ def _items(path: Path) -> None:
                 item.error.error()
 
 
-def _recover(path: Path, recovered: Path) -> None:
+def _recover(path: Path, folder: Path) -> None:
+    recovered = folder / "recovered.mcap"
     recovered.unlink(missing_ok=True)
     recover_log(path, recovered)
-    assert not [finding for finding in check_log(recovered).findings if "checksum" in finding.what]
+    findings = (found.what for found in check_log(recovered).findings)
+    assert not [what for what in findings if "checksum" in what and "PNG" not in what]
+
+
+def _export(path: Path, folder: Path) -> None:
+    shutil.rmtree(folder / "export", ignore_errors=True)
+    export_log(path, folder / "export")
+
+
+def replay(session: Path) -> str:
+    """Play a session back in this process; its exit code, or the name of the typed error that it ends with."""
+    from tools.cli.replay import ReplayOptions, replay_session
+
+    try:
+        with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+            return f"replay {replay_session(ReplayOptions(session, None, json=False))}"
+    except DualcalError as error:
+        return f"replay {type(error).__name__}"
+
+
+def is_replayed(topic: str) -> bool:
+    """Whether a replay needs the topic's messages."""
+    return topic in RECORD_KINDS or camera_of(topic) is not None
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--session", type=Path, default=GOLDEN, help="the session that is replayed with records changed"
+    )
+    parser.add_argument("--replays", type=int, default=100, help="one log of so many is a replayed session's")
     arguments = parser.parse_args()
     chance = random.Random(arguments.seed)
     outcomes: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as folder:
-        sample, mutated, recovered = (Path(folder) / name for name in ("log-0001.mcap", "mutated.mcap", "new.mcap"))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        sample, mutated = folder / "log-0001.mcap", folder / "mutated.mcap"
         write_sample(sample, points=4)
-        content = sample.read_bytes()
+        content, records = sample.read_bytes(), Rewriter(sample)
+        session = shutil.copytree(arguments.session, folder / "session")
+        played = Rewriter(arguments.session / sample.name, is_replayed)
         for number in range(arguments.count):
-            mutated.write_bytes(mutate(content, chance))
+            spoilt = mutated
             try:
-                outcomes[read_all(mutated, recovered)] += 1
+                if number % arguments.replays == 0:
+                    spoilt = session / sample.name
+                    played.write(spoilt, chance)
+                    outcomes[replay(session)] += 1
+                    continue
+                if number % 2:
+                    mutated.write_bytes(mutate(content, chance))
+                else:
+                    records.write(mutated, chance)
+                outcomes[read_all(mutated, folder)] += 1
             except BaseException:
                 kept = Path(tempfile.gettempdir()) / f"mutated-{arguments.seed}-{number}.mcap"
-                mutated.replace(kept)
+                shutil.copyfile(spoilt, kept)
                 print(f"number {number} is kept as {kept}")
                 raise
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"{arguments.count} mutated logs of {len(content)} bytes: {dict(outcomes)}; peak {peak:.0f} MiB")
+    print(f"{arguments.count} mutated logs, half by bytes, half by records: {dict(outcomes)}; peak {peak:.0f} MiB")
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
+from collections import Counter
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -30,7 +30,7 @@ from dualcal_hal.errors import (
     ReplayMismatch,
 )
 from dualcal_hal.robot import JointPath, Mode, MotionState, RobotState, StopResult
-from dualcal_hal.session.journal import StepKey
+from dualcal_hal.session.journal import Journal, StepKey
 from dualcal_hal.session.log import (
     Call,
     FrameRef,
@@ -44,7 +44,10 @@ from dualcal_hal.session.log import (
     StepFinished,
     Worked,
 )
-from dualcal_hal.session.log.attempts import FinishedAttempts
+from dualcal_hal.session.log.attempts import FinishedAttempts, begun_segments
+from dualcal_hal.session.log.check import check_log
+from dualcal_hal.session.log.layout import METADATA_NAME, RECORD_TOPICS
+from dualcal_hal.session.log.writer import FileWriter
 from dualcal_hal.session.result import T_P_A_NAME
 from procedures.detection import Detector
 from procedures.planning.poses import PosePlanner
@@ -222,18 +225,17 @@ def test_a_played_back_run_is_begun_anew_rather_than_gone_on_with(recorded, tmp_
 
 def test_a_run_that_failed_is_replayed_up_to_its_failure(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        lose_the_link(patch, at_move=18)
+        moves = lose_the_link(patch, at_move=18)
         assert dualcal("run", TINY, "--out", tmp_path / "session").exit_code == 1
     result = dualcal("replay", tmp_path / "session")
     assert result.exit_code == 0, result.output
-    assert re.search(
-        r"The recorded run has no result. It ended so: (left|right): move: no answer; check", result.output
-    )
+    said = f"The recorded run has no result. It ended so: {moves[17]}: move: no answer; check the cable"
+    assert said in result.output.splitlines()
     assert "Its captures are the same to the last bit." in result.output
 
 
 def lose_the_link(monkeypatch, at_move):
-    """The motion of that number is answered by the device with an error."""
+    """The motion of that number is answered by the device with an error; gives the arms that are moved, in order."""
     start, moves = SimulatedRobot.start, []
 
     def lossy(self, path):
@@ -243,6 +245,7 @@ def lose_the_link(monkeypatch, at_move):
         return start(self, path)
 
     monkeypatch.setattr(SimulatedRobot, "start", lossy)
+    return moves
 
 
 def test_a_run_without_a_plan_fails_alike(tmp_path, monkeypatch):
@@ -339,18 +342,75 @@ def test_a_cut_log_and_a_damaged_one_are_told(session):
     assert "log-0001.mcap" in result.output
 
 
+def steps_in(session):
+    """The steps that the journal has, and those that the log has, finished."""
+    with LogReader(session / "log-0001.mcap") as reader:
+        logged = [item.key for item in reader.items() if isinstance(item, StepFinished)]
+    return [key for key, _ in Journal(session / "journal.jsonl").results()], logged
+
+
 @pytest.mark.slow
-def test_wherever_a_log_is_cut_the_replay_says_so(session):
+def test_wherever_a_log_is_cut_the_replay_says_what_is_missing(session):
     log = session / "log-0001.mcap"
     whole = log.read_bytes()
+    told = Counter()
     for part in range(50):
         log.write_bytes(whole[: len(whole) * part // 50])
         result = dualcal("replay", session)
-        assert result.exit_code in (1, 2), part
-        assert re.search("it ends before|its log holds nothing|left: read: the recording ends here", result.output), (
-            part,
-            result.output,
-        )
+        try:
+            begun_segments(session)
+        except LogMissing:
+            expected, code = f"{session}: its log holds nothing (log-0001.mcap)", 2
+        else:
+            journalled, logged = steps_in(session)
+            missing = [key for key in journalled if key not in logged]
+            place = missing and (missing[0].constraint or missing[0].kind)
+            expected = f"it ends before {place}" if missing else "left: read: the recording ends here"
+            code = 1
+        assert (result.exit_code, expected in result.output) == (code, True), (part, expected, result.output)
+        told[expected.split(" ")[1]] += 1
+    assert len(told) >= 2
+
+
+def cut_in_motion(session, number):
+    """Leave of the log what came before the end of the motion of that number, as where the power went then."""
+    log = session / "log-0001.mcap"
+    with LogReader(log) as reader:
+        layout, about, messages = reader.layout(), dict(reader.about()), list(reader.messages())
+    ends = 0
+    with log.open("wb") as file:
+        writer = FileWriter(file, layout)
+        writer.write_metadata(METADATA_NAME, about)
+        for topic, message in messages:
+            ends += topic == RECORD_TOPICS[MotionEnded]
+            if ends == number:
+                break
+            writer.write(topic, message.publish_time, message.data, message.sequence)
+        writer.sync()
+    assert any(f"motion {index} has no end" in f.what for f in check_log(log).findings for index in range(1000))
+
+
+@pytest.mark.parametrize("number", [1, 9, 17])
+def test_a_log_that_is_cut_in_a_motion_lacks_the_step_that_it_was_in(session, number):
+    cut_in_motion(session, number)
+    journalled, logged = steps_in(session)
+    missing = next(key for key in journalled if key not in logged)
+    result = dualcal("replay", session)
+    assert result.exit_code == 1
+    assert f"it ends before {missing.constraint or missing.kind}" in result.output
+
+
+@pytest.mark.parametrize("number", [1, 9, 17])
+def test_a_run_that_was_cut_off_in_a_motion_is_replayed_up_to_there(session, number):
+    cut_in_motion(session, number)
+    _, logged = steps_in(session)
+    lines = (session / "journal.jsonl").read_bytes().splitlines(keepends=True)
+    (session / "journal.jsonl").write_bytes(b"".join(lines[: 1 + len(logged)]))
+    (session / "result.json").unlink()
+    result = dualcal("replay", session)
+    assert result.exit_code == 0, result.output
+    assert "The recorded run has no result. It ended so: it was cut off" in result.output
+    assert "Its captures are the same to the last bit." in result.output
 
 
 @pytest.mark.parametrize(
@@ -615,11 +675,19 @@ def test_opening_again_plays_from_the_beginning_in_time_that_goes_on(play):
     assert again.time > first.time
 
 
-def test_a_session_without_a_log_does_not_open(tmp_path):
+def test_a_session_without_a_log_is_refused_before_anything_is_opened(tmp_path):
     devices = [f"{device}.backend=log" for device in ("robots.left", "robots.right", "camera")]
-    backend = ReplayBackend("log", load_cell(PAPER, [f"backends.log={{type: replay, session: {tmp_path}}}", *devices]))
     with pytest.raises(LogMissing, match="has no log"):
-        backend.open(1.0)
+        ReplayBackend("log", load_cell(PAPER, [f"backends.log={{type: replay, session: {tmp_path}}}", *devices]))
+
+
+def test_a_run_on_a_recording_that_is_not_there_leaves_no_session(recorded, tmp_path):
+    cell = (recorded / "cell.yaml").read_text().replace("{type: simulator}", "{type: replay, session: old}")
+    (tmp_path / "cell.yaml").write_text(cell)
+    result = dualcal("run", tmp_path / "cell.yaml", "--out", tmp_path / "new")
+    assert result.exit_code == 2
+    assert f"{tmp_path / 'old'}: does not exist" in result.output
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,8 @@ class ReplayOptions(BaseModel):
 
 
 class ReplayBackend(Backend):
-    """Plays back a whole cell; CellFileError if a device of the cell is another backend's.
+    """Plays back a whole cell; CellFileError if a device of the cell is another backend's, LogMissing where there is
+    nothing to be played back.
 
     Opening it plays the recording from its beginning; its time goes on.
     """
@@ -53,6 +54,7 @@ class ReplayBackend(Backend):
         assert isinstance(options, ReplayOptions)
         self._session = options.session
         _require_whole_cell(name, cell)
+        begun_segments(self._session)  # refused now, before anything is begun
         self._clock = RecordedClock()
         self._timeline: Timeline | None = None
         self._robots = {

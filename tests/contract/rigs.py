@@ -5,6 +5,7 @@ A backend joins by one function here that makes a rig, and its entry in ``RIGS``
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -130,9 +131,12 @@ def recorded(session: Path) -> tuple[Rig, LogRecording]:
 
 
 def replayed(session: Path) -> Rig:
-    """What was recorded there."""
+    """What was recorded there; the one that cannot be opened is of a recording that is gone by then."""
     rig = RIGS["simulator, kinematic"]()
-    return replace(rig, backend=_replay(session), broken=_replay(session / "nothing"))
+    gone = shutil.copytree(session, session / "gone")
+    broken = _replay(gone)
+    shutil.rmtree(gone)
+    return replace(rig, backend=_replay(session), broken=broken)
 
 
 def _replay(session: Path) -> ReplayBackend:

@@ -16,6 +16,7 @@ from dualcal_hal.cellfile import load_cell
 from dualcal_hal.clock import RealClock
 from dualcal_hal.errors import LogNotWritten
 from dualcal_hal.robot import Mode, Robot, RobotState, StopResult
+from dualcal_hal.session import images
 from dualcal_hal.session.images import encode_png
 from dualcal_hal.session.log import Call, FrameRef, LogReader, LogWriter, Note, Picture, Reply, Worked, writer
 from dualcal_hal.session.log.recording import LogRecording
@@ -309,6 +310,26 @@ def test_the_image_is_coded_as_the_sessions_images_are(path):
     with open_log(path) as log:
         log.frame(Frame(IMAGES[0], 0.0, 0))
     assert items(path)[0][0].data == encode_png(IMAGES[0])
+
+
+def test_an_image_that_the_session_keeps_too_is_encoded_once(path, monkeypatch):
+    """In whichever thread; for an image that may change meanwhile it is done anew."""
+    encoded = []
+    encode = images._encode_png
+    monkeypatch.setattr(images, "_encode_png", lambda image: (encoded.append(image[0, 0]), encode(image))[1])
+    fixed, other = IMAGES[0].copy(), IMAGES[1].copy()
+    fixed.setflags(write=False)
+    with open_log(path) as log:
+        log.frame(Frame(fixed, 0.0, 0))
+        assert encode_png(fixed) == encode(fixed)
+        log.frame(Frame(other, 1.0, 1))
+        assert encode_png(other) == encode(other)
+    assert sorted(encoded) == sorted([fixed[0, 0], other[0, 0], other[0, 0]])
+    assert [picture.data for picture in items(path)[0]] == [encode(fixed), encode(other)]
+    assert id(fixed) in images._encoded
+    place = id(fixed)
+    del fixed
+    assert place not in images._encoded, "it is not kept longer than its image"
 
 
 def test_what_the_log_is_of_stands_at_its_beginning(path):

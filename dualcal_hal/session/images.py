@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 import struct
+import threading
+import weakref
 import zlib
 from collections.abc import Iterator
+from concurrent.futures import Future
 from typing import Literal
 
 import numpy as np
@@ -39,7 +42,34 @@ def encode(image: Image, image_format: ImageFormat) -> bytes:
 
 
 def encode_png(image: Image) -> bytes:
-    """Without loss and quickly."""
+    """Without loss and quickly. An image that cannot be written to is encoded once for all who keep it.
+
+    Those are the session's folder and its log, in different threads: who comes second waits for the first.
+    """
+    if image.flags.writeable:
+        return _encode_png(image)
+    place = id(image)
+    with _encoding:
+        found = _encoded.get(place)
+        is_first = found is None or found[0]() is not image
+        encoded = Future[bytes]() if found is None or is_first else found[1]
+        if is_first:
+            _encoded[place] = weakref.ref(image, lambda _: _encoded.pop(place, None)), encoded
+    if is_first:
+        try:
+            encoded.set_result(_encode_png(image))
+        except BaseException as error:
+            encoded.set_exception(error)
+            raise
+    return encoded.result()
+
+
+_encoding = threading.Lock()
+_encoded: dict[int, tuple[weakref.ref[Image], Future[bytes]]] = {}
+"""By the identity of images that are still in use."""
+
+
+def _encode_png(image: Image) -> bytes:
     import cv2
 
     # Sensor noise does not repeat: to look for what does, or for the best filter of each row, takes twice as long and

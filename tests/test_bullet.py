@@ -22,7 +22,7 @@ from backends.simulator.bullet.bodies import STEP, BulletBodies
 from backends.simulator.bullet.client import pybullet
 from backends.simulator.bullet.nearness import Nearness
 from backends.simulator.bullet.stepper import SETTLED, BulletStepper
-from backends.simulator.trajectory import Trajectory
+from dualcal_hal.trajectory import Trajectory
 from backends.simulator.truth import Truth
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.errors import CellFileError, CommandRefused, Contact, MotionFailed

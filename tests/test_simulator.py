@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from backends.simulator import SimulatorBackend
 from backends.simulator.camera import LATENCY
 from backends.simulator.noise import generator
-from backends.simulator.trajectory import Trajectory
+from dualcal_hal.trajectory import Trajectory
 from backends.simulator.world import World
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.clock import VirtualClock

@@ -37,7 +37,8 @@ class Trajectory:
     """An analytic function of time, in s.
 
     On each segment all joints move in proportion, by the shortest trapezoidal (or triangular) profile of
-    velocity that no joint's speed and acceleration forbids. ``end``: when it comes to rest, or did.
+    velocity that no joint's speed and acceleration forbids. ``end``: when it comes to rest, or did; ``arrivals``: when
+    it reaches each waypoint of the path that it follows.
     """
 
     def __init__(self, home: Array, acceleration: Array) -> None:
@@ -45,16 +46,20 @@ class Trajectory:
         self._phases: tuple[_Phase, ...] = ()
         self._rest = np.array(home, dtype=float)
         self.end = 0.0
+        self.arrivals: tuple[float, ...] = ()
 
     def follow(self, path: JointPath, now: float) -> None:
         """Begin at rest to follow ``path``, whose speeds the arm can keep."""
         speed, acceleration = np.array(path.speed), np.array(path.acceleration)
         phases: list[_Phase] = []
         self.end, position = now, self._rest
+        arrivals = []
         for waypoint in path.waypoints:
             phases += _segment(self.end, position, np.array(waypoint), speed, acceleration)
             self.end = phases[-1].end if phases else now
+            arrivals.append(self.end)
             position = np.array(waypoint)
+        self.arrivals = tuple(arrivals)
         self._phases, self._rest = tuple(phases), position
 
     def rest(self, at: Array, since: float) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from dualcal_hal.camera import Camera
 from dualcal_hal.clock import Clock
+from dualcal_hal.errors import UsageError
 from dualcal_hal.robot import Robot
 
 if TYPE_CHECKING:
@@ -70,6 +71,13 @@ class Backend(ABC):
     @abstractmethod
     def camera(self, name: str) -> Camera:
         """The camera of that name; UnknownDevice if it has none."""
+
+    def use_emulator(self, endpoints: Mapping[str, Any]) -> None:
+        """Reach its devices at an emulator that was started for this run: it is simulated from here on; before opening.
+
+        endpoints: what the emulator said of this backend. UsageError where it is none that can be emulated.
+        """
+        raise UsageError(f"{self.name}: a backend of this type has no emulator")
 
     def answer(self, what: str, asked: Any) -> Answer | None:
         """What came of that piece of work in the run that is played back; None where none is.

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dualcal_hal.findings import Finding
+
 Image = NDArray[np.uint8]
 
 
@@ -48,3 +50,7 @@ class Camera(ABC):
 
         Raises DeviceTimeout, LinkLost or NotOpen.
         """
+
+    def findings(self) -> list[Finding]:
+        """What an operator is told of it by a check: its rate, its exposure, whose clock its times are of."""
+        return []

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from dualcal_hal.clock import Clock
-from dualcal_hal.errors import DeviceTimeout, DualcalError, MotionFailed, MotionStopped
+from dualcal_hal.errors import DeviceError, DeviceTimeout, DualcalError, MotionFailed, MotionStopped
+from dualcal_hal.findings import Finding
 
 Joints = tuple[float, ...]
 
@@ -170,6 +171,13 @@ class Robot(ABC):
     def subscribe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
         """Hand each state to ``function`` as it arrives, on the device's thread; returns what ends that."""
 
+    def on_failure(self, function: Callable[[DeviceError], None]) -> Callable[[], None]:
+        """Tell ``function`` at once when the arm's link or drives fail, on the device's thread; returns what ends that.
+
+        A device that has no failures of its own, as a simulated one, tells none.
+        """
+        return lambda: None
+
     @abstractmethod
     def start(self, path: JointPath) -> Motion:
         """Begin to follow ``path``; returns when the device has accepted it. Raises CommandRefused."""
@@ -189,3 +197,7 @@ class Robot(ABC):
     @abstractmethod
     def reset_fault(self, timeout: float) -> None:
         """Acknowledge a fault: the operator's command, called by no procedure."""
+
+    def findings(self) -> list[Finding]:
+        """What an operator is told of it by a check; only read, nothing is moved."""
+        return []

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dualcal_hal.trajectory import Trajectory
 from dualcal_hal.errors import CellFileError, Problem
 from dualcal_hal.robot import JointPath, Joints
+from dualcal_hal.trajectory import Trajectory
 from dualcal_hal.transforms import Array
 
 if TYPE_CHECKING:

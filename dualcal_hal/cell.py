@@ -15,8 +15,9 @@ from dualcal_hal.clock import Clock, RealClock
 from dualcal_hal.config import RobotConfig
 from dualcal_hal.errors import FormatError, Problem, UsageError
 from dualcal_hal.geometry import CellGeometry
-from dualcal_hal.guard import CellGuard, GuardedRobot, JointLimits
+from dualcal_hal.guard import CellGuard, GuardedRobot
 from dualcal_hal.kinematics import Chain
+from dualcal_hal.limits import JointLimits
 from dualcal_hal.registry import backend_class
 from dualcal_hal.robot import Joints
 from dualcal_hal.session.log.recording import Recording
@@ -127,7 +128,7 @@ class Cell:
         return all(backend.simulated for backend in self._backends.values())
 
     def _arm(self, name: str, config: RobotConfig) -> Arm:
-        limits = JointLimits(config.lower, config.upper, config.speed, config.acceleration)
+        limits = JointLimits.of(config)
         device = self._backends[config.backend].robot(name)
         self._recording.watch(device)
         robot = GuardedRobot(self._recording.robot(device), limits, self.clock)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from dualcal_hal.clock import Clock
 from dualcal_hal.errors import CommandRefused, DeviceError
 from dualcal_hal.geometry import BETWEEN_SAMPLES, CellGeometry, Placement
+from dualcal_hal.limits import JointLimits
 from dualcal_hal.robot import JointPath, Mode, Motion, MotionState, Robot, RobotState, StopResult
 from dualcal_hal.transforms import Array
 
@@ -36,17 +36,6 @@ READING_SLACK = 0.001
 """m by which clearance may seem to fall because joints are read, not known."""
 
 _ENCODERS = "check the link and the encoders"
-_LIMIT_TOLERANCE = 1e-6  # rad, for what rounding does at a limit
-
-
-@dataclass(frozen=True, eq=False)
-class JointLimits:
-    """lower, upper: (n,) rad; speed: (n,) rad/s; acceleration: (n,) rad/s^2, all largest allowed."""
-
-    lower: Array
-    upper: Array
-    speed: Array
-    acceleration: Array
 
 
 class CellGuard:
@@ -172,7 +161,8 @@ class GuardedRobot(Robot):
         """Begin to follow ``path`` (rad, rad/s, rad/s^2) if nothing speaks against it, else CommandRefused."""
         if self._check_cell is None:
             raise CommandRefused(self.name, "move", "the cell is not open", "open it first")
-        self._check_values(path)
+        if (why := self._limits.objection(path)) is not None:
+            raise CommandRefused(self.name, "move", why, "nothing was sent; this is an error in the plan")
         with self._starting:
             return self._start(path, self._check_cell)
 
@@ -212,26 +202,3 @@ class GuardedRobot(Robot):
             if len(values) != len(self._limits.lower) or not np.all(np.isfinite(values)):
                 return f"its {what} are not {len(self._limits.lower)} finite numbers: {values}"
         return None
-
-    def _check_values(self, path: JointPath) -> None:
-        limits = self._limits
-        if not path.waypoints:
-            self._refuse("the path is empty")
-        numbers = [("waypoint", w) for w in path.waypoints]
-        for what, values in (*numbers, ("speed", path.speed), ("acceleration", path.acceleration)):
-            if len(values) != self.joints or not np.all(np.isfinite(values)):
-                self._refuse(f"the {what} is not {self.joints} finite numbers: {values}")
-        waypoints = np.array(path.waypoints)
-        beyond = np.maximum(limits.lower - waypoints, waypoints - limits.upper)
-        if np.max(beyond) > _LIMIT_TOLERANCE:
-            joint = int(np.unravel_index(np.argmax(beyond), beyond.shape)[1])
-            self._refuse(f"joint {joint + 1} would be {np.rad2deg(np.max(beyond)):.3f} deg beyond its limit")
-        for what, bound, largest in (
-            ("speed", path.speed, limits.speed),
-            ("acceleration", path.acceleration, limits.acceleration),
-        ):
-            if np.any(np.asarray(bound) > largest * (1 + 1e-9)) or np.any(np.asarray(bound) <= 0):
-                self._refuse(f"the {what} is not between zero and the arm's own")
-
-    def _refuse(self, why: str) -> None:
-        raise CommandRefused(self.name, "move", why, "nothing was sent; this is an error in the plan")

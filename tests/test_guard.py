@@ -11,7 +11,8 @@ from dualcal_hal.cell import Cell
 from dualcal_hal.clock import VirtualClock
 from dualcal_hal.errors import CommandRefused
 from dualcal_hal.geometry import BETWEEN_SAMPLES, LARGEST_MOTION, CellGeometry, Placement
-from dualcal_hal.guard import PLANNERS_SHARE, CellGuard, GuardedRobot, JointLimits
+from dualcal_hal.guard import PLANNERS_SHARE, CellGuard, GuardedRobot
+from dualcal_hal.limits import JointLimits
 from dualcal_hal.robot import JointPath, Mode, Motion, Robot, RobotState, StopResult
 from tests.cells import paper_cell
 
@@ -186,7 +187,7 @@ def placed_arms(q_a, q_p, placement):
     clock = VirtualClock()
     devices, robots = [], []
     for config, q in ((CONFIG.active, q_a), (CONFIG.passive, q_p)):
-        limits = JointLimits(config.lower, config.upper, config.speed, config.acceleration)
+        limits = JointLimits.of(config)
         devices.append(Recording(clock, tuple(map(float, q))))
         robots.append(GuardedRobot(devices[-1], limits, clock))
     guard = CellGuard(*robots, GEOMETRY, placement, CONFIG.procedure.clearance)

@@ -26,12 +26,11 @@ class JointMapConfig(Section):
     """From the joints of the kinematics to the controller's: order, then sign and offset, then coupling."""
 
     order: tuple[AtLeast1, ...] | None = None
-    """For each joint of the controller the joint of the kinematics that it is, counted from 1; the same order where left
-    out."""
+    """For each joint of the controller the joint of the kinematics that it is, counted from 1; the same if left out."""
     sign: tuple[Annotated[Number, Field(ge=-1, le=1)], ...] | None = None
     """1 or -1 for each joint of the controller; all 1 where left out."""
     offset_deg: tuple[Number, ...] | None = None
-    """What each joint of the controller shows where that of the kinematics is at zero, degrees; all 0 where left out."""
+    """What a joint of the controller shows where that of the kinematics is at zero, degrees; all 0 where left out."""
     coupling: tuple[Coupling, ...] = ()
     """Joints that take others along, one after the other."""
 

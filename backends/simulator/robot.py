@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from backends.simulator.world import World
 from dualcal_hal.errors import CommandRefused, DeviceError
+from dualcal_hal.limits import JointLimits
 from dualcal_hal.robot import JointPath, Mode, Motion, Robot, RobotState, StopResult
 
 if TYPE_CHECKING:
     from dualcal_hal.config import RobotConfig
 
 STATE_PERIOD = 0.05  # s of simulated time between subscribed states: what a viewer needs, at half the cost of 50 Hz
-_ROUNDING = 1e-6  # rad by which a waypoint may exceed a limit
 
 
 class SimulatedRobot(Robot):
@@ -26,13 +24,12 @@ class SimulatedRobot(Robot):
 
     def __init__(self, name: str, config: RobotConfig, opened: Callable[[str, str], World]) -> None:
         self.name = name
-        self._lower, self._upper = config.lower, config.upper
-        self._largest = {"speed": config.speed, "acceleration": config.acceleration}
+        self._limits = JointLimits.of(config)
         self._opened = opened
 
     @property
     def joints(self) -> int:
-        return len(self._lower)
+        return len(self._limits.lower)
 
     def read(self, timeout: float) -> RobotState:
         return self._world("read").arms[self.name].state("read")
@@ -49,7 +46,8 @@ class SimulatedRobot(Robot):
 
     def start(self, path: JointPath) -> Motion:
         arm = self._world("move").arms[self.name]
-        self._check(path)
+        if (why := self._limits.objection(path)) is not None:
+            raise CommandRefused(self.name, "move", why, "check the path")
         return arm.follow(path)
 
     def stop(self, reason: str) -> StopResult:
@@ -67,33 +65,6 @@ class SimulatedRobot(Robot):
 
     def _world(self, attempted: str) -> World:
         return self._opened(self.name, attempted)
-
-    def _check(self, path: JointPath) -> None:
-        bounds = {"speed": path.speed, "acceleration": path.acceleration}
-        waypoints = {f"waypoint {number}": q for number, q in enumerate(path.waypoints, start=1)}
-        if not waypoints:
-            self._refuse("the path has no waypoint")
-        for what, values in {**bounds, **waypoints}.items():
-            if len(values) != self.joints:
-                self._refuse(f"{what} has {len(values)} values for {self.joints} joints")
-            if not np.all(np.isfinite(values)):
-                self._refuse(f"{what} is not finite")
-        for what, values in bounds.items():
-            if min(values) <= 0:
-                self._refuse(f"{what} must be above 0 for every joint")
-            if np.any(np.asarray(values) > self._largest[what] * (1 + 1e-9)):
-                self._refuse(f"{what} is beyond the arm's own")
-        for what, values in waypoints.items():
-            outside = np.maximum(self._lower - values, np.asarray(values) - self._upper)
-            joint = int(np.argmax(outside))
-            if outside[joint] > _ROUNDING:
-                self._refuse(
-                    f"{what}: joint {joint + 1} at {np.degrees(values[joint]):.3f} deg is outside its limits "
-                    f"{np.degrees(self._lower[joint]):g} to {np.degrees(self._upper[joint]):g} deg"
-                )
-
-    def _refuse(self, why: str) -> None:
-        raise CommandRefused(self.name, "move", why, "check the path")
 
 
 class _Subscription:

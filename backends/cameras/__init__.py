@@ -1,0 +1,1 @@
+"""Real cameras: a stream over ZeroMQ, what OpenCV opens, and GenICam."""

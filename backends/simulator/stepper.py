@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -17,6 +17,21 @@ if TYPE_CHECKING:
     from backends.simulator.bullet.bodies import BulletBodies
     from backends.simulator.truth import Truth
     from dualcal_hal.config import CellConfig
+
+
+class SetPoints(Protocol):
+    """Where an arm's motors are to have its joints, as a function of time in s."""
+
+    @property
+    def end(self) -> float:
+        """From when on they rest; infinity where that is not known yet."""
+
+    @property
+    def destination(self) -> Joints:
+        """The joint angles in rad at which they are to rest, or do."""
+
+    def sample(self, when: float) -> tuple[Array, Array]:
+        """Joint angles (n,) in rad and velocities (n,) in rad/s."""
 
 
 class Stepper(ABC):
@@ -33,12 +48,17 @@ class Stepper(ABC):
         self._trajectories = {
             name: Trajectory(robot.home, robot.acceleration) for name, robot in sorted(cell.robots.items())
         }
+        self._set_points: dict[str, SetPoints] = dict(self._trajectories)
 
     def follow(self, arm: str, path: JointPath, now: float) -> float:
         """Have an arm at rest begin to follow ``path``; returns when its set points come to rest."""
         trajectory = self._trajectories[arm]
         trajectory.follow(path, now)
         return trajectory.end
+
+    def track(self, arm: str, set_points: SetPoints, now: float) -> None:
+        """Have an arm's joints go where ``set_points`` of somebody else are, from ``now`` on."""
+        self._set_points[arm] = set_points
 
     def brake(self, arm: str, now: float) -> float:
         """Bring an arm to rest on its path as fast as it can; returns when its set points come to rest."""
@@ -53,7 +73,7 @@ class Stepper(ABC):
 
     def destination(self, arm: str) -> Joints:
         """The joint angles in rad at which an arm is to rest, or does."""
-        return self._trajectories[arm].destination
+        return self._set_points[arm].destination
 
     @abstractmethod
     def sample(self, arm: str, when: float) -> tuple[Array, Array]:
@@ -76,10 +96,10 @@ class KinematicStepper(Stepper):
     """Joints are exactly where their trajectories have them; nothing is in anything's way."""
 
     def sample(self, arm: str, when: float) -> tuple[Array, Array]:
-        return self._trajectories[arm].sample(when)
+        return self._set_points[arm].sample(when)
 
     def next_look(self, arm: str, now: float) -> float | None:
-        end = self._trajectories[arm].end
+        end = self._set_points[arm].end
         return end if now < end else None
 
     def close(self) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from backends.simulator.bullet.bodies import STEP, BulletBodies
 from backends.simulator.bullet.nearness import Near, Nearness
-from backends.simulator.stepper import Stepper
+from backends.simulator.stepper import SetPoints, Stepper
 from dualcal_hal.robot import JointPath
 from dualcal_hal.robot import Joints as Target
 from dualcal_hal.session.distances import DISTANCES, Distances
@@ -69,12 +69,12 @@ class BulletStepper(Stepper):
         self._halt_on_contact(self._past[0][1])
 
     def follow(self, arm: str, path: JointPath, now: float) -> float:
-        self._advance(now)
-        if not self._moving:
-            self._time = now
-        if arm not in self._moving:
-            self._moving.append(arm)
+        self._set_moving(arm, now)
         return super().follow(arm, path, now)
+
+    def track(self, arm: str, set_points: SetPoints, now: float) -> None:
+        self._set_moving(arm, now)
+        super().track(arm, set_points, now)
 
     def brake(self, arm: str, now: float) -> float:
         self._advance(now)
@@ -101,6 +101,13 @@ class BulletStepper(Stepper):
         self._moving = []
         self.scene.close()
 
+    def _set_moving(self, arm: str, now: float) -> None:
+        self._advance(now)
+        if not self._moving:
+            self._time = now
+        if arm not in self._moving:
+            self._moving.append(arm)
+
     def _advance(self, until: float) -> None:
         # Times are sums of steps: one that is due must not be missed by a rounding.
         while self._moving and self._time + STEP <= until + 1e-9:
@@ -109,7 +116,7 @@ class BulletStepper(Stepper):
 
     def _step(self) -> None:
         for arm in self._moving:
-            self.scene.drive(arm, *self._trajectories[arm].sample(self._time))
+            self.scene.drive(arm, *self._set_points[arm].sample(self._time))
         self.scene.step()
         joints = {arm: self.scene.joints(arm) for arm in self.scene.arms}
         if next(self._steps) % STEPS_A_RECORD == 0:
@@ -120,9 +127,9 @@ class BulletStepper(Stepper):
         self._past.append((self._time, {**joints, **still}))
 
     def _has_settled(self, arm: str, q: Array, velocity: Array) -> bool:
-        trajectory = self._trajectories[arm]
-        off = np.max(np.abs(q - trajectory.destination))
-        return bool(trajectory.end <= self._time and off <= SETTLED and np.max(np.abs(velocity)) <= STILL)
+        set_points = self._set_points[arm]
+        off = np.max(np.abs(q - set_points.destination))
+        return bool(set_points.end <= self._time and off <= SETTLED and np.max(np.abs(velocity)) <= STILL)
 
     def _halt_on_contact(self, joints: Joints) -> None:
         contact = self._nearness.contact({arm: STEP * np.abs(velocity) for arm, (_, velocity) in joints.items()})

@@ -48,7 +48,7 @@ class Camera(ABC):
     def grab(self, not_before: float, timeout: float) -> Frame:
         """A frame whose exposure began at or after ``not_before`` (clock's seconds), never an older one.
 
-        Raises DeviceTimeout, LinkLost or NotOpen.
+        Raises DeviceTimeout, FrameRefused, LinkLost or NotOpen.
         """
 
     def findings(self) -> list[Finding]:

@@ -22,6 +22,7 @@
         │   └── Contact                     parts touch that should not
         ├── ArmMoved (RuntimeError)
         ├── StopFailed (RuntimeError)
+        ├── FrameRefused (ValueError)       an image that came and must not be used
         ├── ReplayMismatch (ValueError)     a command that is not the recorded one
         ├── FrameMissing (LookupError)      an image that the recording should have
         └── LogEnded (EOFError)             a command after the end of the recording
@@ -152,6 +153,10 @@ class ArmMoved(DeviceError, RuntimeError):
 
 class StopFailed(DeviceError, RuntimeError):
     """An arm was told to stop and did not confirm that it stands."""
+
+
+class FrameRefused(DeviceError, ValueError):
+    """An image that came is damaged, another camera's or of another size, and must not be used."""
 
 
 class ReplayMismatch(DeviceError, ValueError):

@@ -14,7 +14,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
@@ -106,10 +106,7 @@ def standing_alone(file: CellFile) -> tuple[str, dict[str, Path]]:
     document = _Source("cell.yaml", file.text).document()
     moved = False
     for name, entry in file.cell.backends.items():
-        for option, value in entry.checked:
-            if isinstance(value, Path) and str(value) != document["backends"][name].get(option):
-                document["backends"][name][option] = str(value)
-                moved = True
+        moved |= _name_whole_paths(document["backends"][name], dict(entry.checked))
     for name, fixture in file.cell.fixtures.items():
         if fixture.mesh is not None:
             original = Path(fixture.mesh.file)
@@ -118,6 +115,23 @@ def standing_alone(file: CellFile) -> tuple[str, dict[str, Path]]:
             copies[own] = original
             document["fixtures"][name]["mesh"]["file"] = own
     return (_dumped(document) if copies or moved else file.text), copies
+
+
+def _name_whole_paths(options: Any, checked: Any) -> bool:
+    """Have what backends read be named by its whole path, however deep in their options; says whether any was not."""
+    moved = False
+    written = range(len(options)) if isinstance(options, list) else options.keys()
+    for place, value in enumerate(checked) if isinstance(checked, tuple) else checked.items():
+        if place not in written:
+            continue  # left out, so its default is no file
+        if isinstance(value, Path) and options[place] != str(value):
+            options[place] = str(value)
+            moved = True
+        elif isinstance(value, BaseModel):
+            moved |= _name_whole_paths(options[place], dict(value))
+        elif isinstance(value, tuple | dict):
+            moved |= _name_whole_paths(options[place], value)
+    return moved
 
 
 def differences(used: str, given: str) -> str:

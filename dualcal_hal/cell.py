@@ -18,12 +18,16 @@ from dualcal_hal.geometry import CellGeometry
 from dualcal_hal.guard import CellGuard, GuardedRobot
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.limits import JointLimits
+from dualcal_hal.pace import REDUCED_SPEED, Pace
 from dualcal_hal.registry import backend_class
-from dualcal_hal.robot import Joints
+from dualcal_hal.robot import Joints, Mode
 from dualcal_hal.session.log.recording import Recording
 
 OPEN_TIMEOUT = 10.0
 """Seconds that a backend may take to open."""
+
+ENABLE_TIMEOUT = 10.0
+"""Seconds within which an arm's drives are to be on."""
 
 CAMERA_NAME = "camera"
 
@@ -47,9 +51,14 @@ class Arm:
 class Cell:
     """Both arms and the camera, open; a context manager that closes what it opened, in reverse, on any exit."""
 
-    def __init__(self, cell: CellFile) -> None:
-        """Refuses what the backends cannot serve; opens nothing yet."""
+    def __init__(self, cell: CellFile, share: float = 1.0, *, verified: bool = False) -> None:
+        """Refuses what the backends cannot serve; opens nothing yet.
+
+        share: of their speeds at which the arms move; verified: whether a calibration of this cell was, without which
+        no part of arms that are not simulated is faster than REDUCED_SPEED.
+        """
         self._file = cell
+        self._share, self._verified = share, verified
         config = cell.cell
         used = {config.active.backend, config.passive.backend, config.camera.backend}
         types = {name: config.backends[name].type for name in config.backends if name in used}
@@ -77,7 +86,16 @@ class Cell:
             self.passive = self._arm(config.passive_name, config.passive)
             self.camera = self._recording.camera(self._backends[config.camera.backend].camera(CAMERA_NAME))
             shapes, nominal = CellGeometry.of(config), config.nominal.placement
-            self.guard = CellGuard(self.active.robot, self.passive.robot, shapes, nominal, config.procedure.clearance)
+            self.guard = CellGuard(
+                self.active.robot,
+                self.passive.robot,
+                shapes,
+                nominal,
+                config.procedure.clearance,
+                self.pace,
+                config.corridor,
+                watched=all(backend.time == "real" for backend in self._backends.values()),
+            )
             self._devices = opening.pop_all()
         return self
 
@@ -121,6 +139,31 @@ class Cell:
     def recording(self) -> Recording:
         """What is told of all that happens."""
         return self._recording
+
+    def use_emulator(self, endpoints: Mapping[str, Any]) -> None:
+        """Reach all devices at an emulator started for this run, by the backends' names; before they are opened."""
+        for name, backend in self._backends.items():
+            if name not in endpoints:
+                raise UsageError(f"the emulator does not say where it serves backend '{name}'")
+            backend.use_emulator(endpoints[name])
+
+    def enable_arms(self) -> list[str]:
+        """Switch the drives of both arms on where they are off: the operator's command, before a procedure begins.
+
+        Returns the arms that were switched on. It passes by the recording, as it is no part of what a procedure does.
+        """
+        enabled = []
+        for name in (self._file.cell.active_name, self._file.cell.passive_name):
+            robot = self._backends[self._file.cell.robots[name].backend].robot(name)
+            if robot.read(ENABLE_TIMEOUT).mode is not Mode.READY:
+                robot.enable(ENABLE_TIMEOUT)
+                enabled.append(name)
+        return enabled
+
+    @property
+    def pace(self) -> Pace:
+        """How fast its arms may be."""
+        return Pace(self._share, None if self.simulated or self._verified else REDUCED_SPEED)
 
     @property
     def simulated(self) -> bool:

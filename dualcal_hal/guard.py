@@ -9,10 +9,16 @@ import numpy as np
 
 from dualcal_hal.clock import Clock
 from dualcal_hal.errors import CommandRefused, DeviceError
-from dualcal_hal.geometry import BETWEEN_SAMPLES, CellGeometry, Placement
+from dualcal_hal.findings import Finding
+from dualcal_hal.geometry import BETWEEN_SAMPLES, ArmBody, CellGeometry, Placement
 from dualcal_hal.limits import JointLimits
-from dualcal_hal.robot import JointPath, Mode, Motion, MotionState, Robot, RobotState, StopResult
+from dualcal_hal.pace import FULL_PACE, Pace, fastest_part, part_speed
+from dualcal_hal.robot import JointPath, Joints, Mode, Motion, MotionState, Robot, RobotState, StopResult
 from dualcal_hal.transforms import Array
+from dualcal_hal.watch import Bounds, Watch
+
+_Admission = Callable[[RobotState, JointPath], Bounds | None]
+"""Judges a path from where the arm stands; what it has to keep on the way, None where it is not watched."""
 
 READ_TIMEOUT = 0.5
 """Seconds within which an arm must answer with its state."""
@@ -35,16 +41,28 @@ So a plan that kept the whole of it, for the same placement, is not refused.
 READING_SLACK = 0.001
 """m by which clearance may seem to fall because joints are read, not known."""
 
+LARGEST_STEP = 2 * np.pi
+"""rad that no joint turns by from one waypoint to the next: more is a mistake, of units or of where the arm stands."""
+
+WATCH_SLACK = 0.010
+"""m by which clearance may be less than anywhere on the path while the arm moves: readings are late and scatter."""
+
+_LEVER = 0.2  # m; a corner that is cut by so much more turns a joint by less
+_ROUNDING = 1e-6
 _ENCODERS = "check the link and the encoders"
 
 
 class CellGuard:
-    """Holds both arms; every motion of either passes here.
+    """Holds both arms; every motion of either passes here, at the ``pace`` that the cell allows.
 
     Refused with CommandRefused before the first byte: values that are not finite or too many or few, positions
     beyond limits, speeds beyond the arm's, an arm that is not ready or whose state is not fresh, the second of two
     arms at a time, and paths that come closer than half the clearance to the other arm, the floor, a fixture or the arm
-    itself, whatever the error of the bases that the placement allows for.
+    itself, whatever the error of the bases that the placement allows for; a speed beyond the pace, and an arm that
+    moves at a speed of its own which nobody has confirmed to be within it.
+
+    Where time is real both arms are watched while one moves: what goes wrong with one stops both, and ends the motion
+    by its error.
     """
 
     def __init__(
@@ -54,36 +72,107 @@ class CellGuard:
         geometry: CellGeometry,
         placement: Placement,
         clearance: float,
+        pace: Pace = FULL_PACE,
+        corridor: float = 0.0,
+        watched: bool = False,
     ) -> None:
+        """``corridor``: m by which arms may cut corners of their paths; ``watched``: whether motions are."""
         self._active, self._passive = active, passive
         self._geometry = geometry
+        self._pace, self._corridor, self._watched = pace, corridor, watched
         self._placement = placement
         self._clearance = clearance * PLANNERS_SHARE
         one_at_a_time = threading.Lock()
-        active.admit(self._check_active, one_at_a_time)
-        passive.admit(self._check_passive, one_at_a_time)
+        active.admit(self._admit_active, one_at_a_time)
+        passive.admit(self._admit_passive, one_at_a_time)
 
     def place(self, placement: Placement, geometry: CellGeometry) -> None:
         """Judge clearance with the bases there and these shapes from here on; before, they are the nominal ones."""
         self._placement, self._geometry = placement, geometry
 
-    def _check_active(self, waypoints: Array) -> None:
-        other = self._standing(self._passive)
-        path = self._geometry.active.sampled(waypoints)
-        self._require(
+    def path(self, arm: str, start: Joints, waypoints: tuple[Joints, ...]) -> JointPath:
+        """The fastest path of an arm from ``start`` through ``waypoints`` (rad) at the cell's pace."""
+        robot, body = self._side(arm)
+        return self._pace_of(robot).path(start, waypoints, robot.limits, body)
+
+    def _side(self, arm: str) -> tuple[GuardedRobot, ArmBody]:
+        if arm == self._active.name:
+            return self._active, self._geometry.active
+        return self._passive, self._geometry.passive
+
+    def _pace_of(self, robot: GuardedRobot) -> Pace:
+        return self._pace if robot.keeps_speed else self._pace.at_most(robot.confirmed_speed)
+
+    def _admit_active(self, start: RobotState, path: JointPath) -> Bounds | None:
+        geometry, placement = self._geometry, self._placement
+        other = self._standing(self._passive).positions
+        samples = geometry.active.sampled([start.positions, *path.waypoints])
+        least = self._require(
             self._active.name,
-            self._geometry.between(path, [other.positions], self._placement),
-            self._geometry.active.own_clearance(path),
+            geometry.between(samples, [other], placement),
+            geometry.active.own_clearance(samples),
         )
 
-    def _check_passive(self, waypoints: Array) -> None:
-        other = self._standing(self._active)
-        path = self._geometry.passive.sampled(waypoints)
-        self._require(
+        def clearance(q: Array, q_other: Array) -> float:
+            own = geometry.active.own_clearance(q)
+            return float(np.minimum(own, geometry.between(q, q_other, placement))[0])
+
+        return self._bounds(self._active, geometry.active, start, path, clearance, least)
+
+    def _admit_passive(self, start: RobotState, path: JointPath) -> Bounds | None:
+        geometry, placement = self._geometry, self._placement
+        other = self._standing(self._active).positions
+        samples = geometry.passive.sampled([start.positions, *path.waypoints])
+        least = self._require(
             self._passive.name,
-            self._geometry.between([other.positions], path, self._placement),
-            self._geometry.passive.own_clearance(path),
+            geometry.between([other], samples, placement),
+            geometry.passive.own_clearance(samples),
         )
+
+        def clearance(q: Array, q_other: Array) -> float:
+            own = geometry.passive.own_clearance(q)
+            return float(np.minimum(own, geometry.between(q_other, q, placement))[0])
+
+        return self._bounds(self._passive, geometry.passive, start, path, clearance, least)
+
+    def _bounds(
+        self,
+        robot: GuardedRobot,
+        body: ArmBody,
+        start: RobotState,
+        path: JointPath,
+        clearance: Callable[[Array, Array], float],
+        least: float,
+    ) -> Bounds | None:
+        """What the motion has to keep while it is watched; CommandRefused if it would be too fast."""
+        self._require_pace(robot, body, start, path)
+        if not self._watched:
+            return None
+        return Bounds(
+            other=self._passive if robot is self._active else self._active,
+            waypoints=np.array([start.positions, *path.waypoints]),
+            corner=self._corridor / _LEVER,
+            clearance=clearance,
+            least=least - WATCH_SLACK - self._corridor,
+            speed=lambda q, velocity: part_speed(body, q, velocity),
+            fastest=self._pace.bound,
+        )
+
+    def _require_pace(self, robot: GuardedRobot, body: ArmBody, start: RobotState, path: JointPath) -> None:
+        pace, needed = self._pace_of(robot), self._pace.to_be_confirmed
+        if not robot.keeps_speed and needed is not None:
+            confirmed = robot.confirmed_speed
+            if confirmed is None or confirmed > needed * (1 + 1e-9):
+                said = "nobody has confirmed it" if confirmed is None else f"{confirmed * 1e3:.0f} mm/s are confirmed"
+                why = f"its controller moves at a speed of its own, {needed * 1e3:.0f} mm/s are allowed, and {said}"
+                advice = "set it there, and say so in the cell file: controller_speed_confirmed: {mm_s: ...}"
+                raise CommandRefused(robot.name, "move", why, advice)
+        if pace.bound is None:
+            return
+        fastest = fastest_part(body, start.positions, path)
+        if fastest > pace.bound * (1 + _ROUNDING):
+            why = f"a part would move at {fastest * 1e3:.0f} mm/s, and {pace.bound * 1e3:.0f} mm/s are allowed"
+            raise CommandRefused(robot.name, "move", why, "nothing was sent; this is an error in the plan")
 
     def _standing(self, other: GuardedRobot) -> RobotState:
         """Where the other arm stands; one that moves is nowhere for long enough to keep clear of."""
@@ -92,7 +181,8 @@ class CellGuard:
             raise CommandRefused(other.name, "move the other arm", "this one is moving", "wait until it has settled")
         return state
 
-    def _require(self, arm: str, between: Array, own: Array) -> None:
+    def _require(self, arm: str, between: Array, own: Array) -> float:
+        """The least clearance (m) on the way; CommandRefused if that is too little."""
         if between[0] < BETWEEN_SAMPLES - READING_SLACK:
             # Every way could lead deeper into what the arm may be touching.
             why = "the bases may stand so that it touches the other arm, or what stands about that, where it is"
@@ -116,6 +206,7 @@ class CellGuard:
                 why = f"the path may come within {least * 1e3:.1f} mm of {what}; {needed}"
                 advice = "nothing was sent; plan anew or check the nominal transforms in the cell file"
             raise CommandRefused(arm, "move", why, advice)
+        return float(min(np.min(between), np.min(own)) - BETWEEN_SAMPLES)
 
 
 class GuardedRobot(Robot):
@@ -124,9 +215,9 @@ class GuardedRobot(Robot):
     def __init__(self, robot: Robot, limits: JointLimits, clock: Clock) -> None:
         self.name = robot.name
         self._robot = robot
-        self._limits = limits
+        self.limits = limits
         self._clock = clock
-        self._check_cell: Callable[[Array], None] | None = None
+        self._admit: _Admission | None = None
         self._starting = threading.Lock()
         self._motion: Motion | None = None
 
@@ -135,13 +226,13 @@ class GuardedRobot(Robot):
         """Whether the motion that was started last has not ended."""
         return self._motion is not None and self._motion.state is MotionState.RUNNING
 
-    def admit(self, check: Callable[[Array], None], lock: threading.Lock) -> None:
-        """Let ``check`` judge the waypoints (w, n) of each path, the first where the arm stands (called by CellGuard).
+    def admit(self, admission: _Admission, lock: threading.Lock) -> None:
+        """Let ``admission`` judge each path, from where the arm stands (called by CellGuard).
 
         Without it nothing moves. ``lock`` is held from the judging until the motion has begun, so that no other
         begins meanwhile.
         """
-        self._check_cell, self._starting = check, lock
+        self._admit, self._starting = admission, lock
 
     @property
     def joints(self) -> int:
@@ -157,23 +248,77 @@ class GuardedRobot(Robot):
     def subscribe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
         return self._robot.subscribe(function)
 
+    def on_failure(self, function: Callable[[DeviceError], None]) -> Callable[[], None]:
+        return self._robot.on_failure(function)
+
+    @property
+    def keeps_speed(self) -> bool:
+        return self._robot.keeps_speed
+
+    @property
+    def confirmed_speed(self) -> float | None:
+        return self._robot.confirmed_speed
+
+    def findings(self) -> list[Finding]:
+        return self._robot.findings()
+
     def start(self, path: JointPath) -> Motion:
         """Begin to follow ``path`` (rad, rad/s, rad/s^2) if nothing speaks against it, else CommandRefused."""
-        if self._check_cell is None:
+        admit = self._admit
+        if admit is None:
             raise CommandRefused(self.name, "move", "the cell is not open", "open it first")
-        if (why := self._limits.objection(path)) is not None:
+        if (why := self.limits.objection(path)) is not None:
             raise CommandRefused(self.name, "move", why, "nothing was sent; this is an error in the plan")
         with self._starting:
-            return self._start(path, self._check_cell)
+            self._motion = self._start(path, admit)
+            return self._motion
 
-    def _start(self, path: JointPath, check_cell: Callable[[Array], None]) -> Motion:
+    def _start(self, path: JointPath, admit: _Admission) -> Motion:
         state = self.fresh_state("move")
         if state.mode is not Mode.READY or state.faults:
             what = ", ".join([f"mode '{state.mode}'", *state.faults])
             raise CommandRefused(self.name, "move", f"the arm is not ready: {what}", "clear it at the controller")
-        check_cell(np.array([state.positions, *path.waypoints]))
-        self._motion = self._robot.start(path)
-        return self._motion
+        steps = np.abs(np.diff([state.positions, *path.waypoints], axis=0))
+        if np.max(steps) > LARGEST_STEP:
+            joint = int(np.unravel_index(np.argmax(steps), steps.shape)[1])
+            why = f"joint {joint + 1} would turn by {np.rad2deg(np.max(steps)):.0f} deg in one step"
+            raise CommandRefused(self.name, "move", why, "nothing was sent; check the units and where the arm stands")
+        bounds = admit(state, path)
+        if bounds is None:
+            return self._robot.start(path)
+        return self._watched(path, bounds)
+
+    def _watched(self, path: JointPath, bounds: Bounds) -> Motion:
+        """A motion that ends as the device's does, or by what the watch finds: then both arms are stopped first."""
+        motion = Motion(self.name, self._clock)
+        found: list[DeviceError] = []
+
+        def alarm(error: DeviceError) -> None:
+            found.append(error)
+            for robot in (self, bounds.other):
+                try:
+                    result = robot.stop(error.why)
+                except Exception as second:  # noqa: BLE001 - the other arm has to be stopped, too; told by the note
+                    error.add_note(f"{robot.name}: could not be stopped ({second}): use the emergency stop")
+                    continue
+                if not result.confirmed:
+                    error.add_note(f"{robot.name}: its stop is not confirmed ({result.detail}): use the emergency stop")
+            motion.end(MotionState.FAILED, None, error)
+
+        watch = Watch(self._robot, bounds, self._clock, alarm)
+        try:
+            sent = self._robot.start(path)
+        except BaseException:
+            watch.end()
+            raise
+
+        def ended() -> None:
+            watch.end()
+            if not found:
+                motion.end(sent.state, sent.final, sent.error)
+
+        sent.on_end(ended)
+        return motion
 
     def stop(self, reason: str) -> StopResult:
         return self._robot.stop(reason)
@@ -199,6 +344,6 @@ class GuardedRobot(Robot):
 
     def _unusable(self, state: RobotState) -> str | None:
         for what, values in (("positions", state.positions), ("velocities", state.velocities)):
-            if len(values) != len(self._limits.lower) or not np.all(np.isfinite(values)):
-                return f"its {what} are not {len(self._limits.lower)} finite numbers: {values}"
+            if len(values) != len(self.limits.lower) or not np.all(np.isfinite(values)):
+                return f"its {what} are not {len(self.limits.lower)} finite numbers: {values}"
         return None

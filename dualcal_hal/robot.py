@@ -163,6 +163,16 @@ class Robot(ABC):
     def joints(self) -> int:
         """How many joints it has."""
 
+    @property
+    def keeps_speed(self) -> bool:
+        """Whether it is no faster than a path says; if not it moves at a speed of its controller's own."""
+        return True
+
+    @property
+    def confirmed_speed(self) -> float | None:
+        """m/s that its controller was confirmed to be set to, if it does not keep a path's; None where nobody has."""
+        return None
+
     @abstractmethod
     def read(self, timeout: float) -> RobotState:
         """A state sampled after the call; raises DeviceTimeout, LinkLost or NotOpen, never an old state."""

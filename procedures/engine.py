@@ -20,7 +20,7 @@ from dualcal_hal.errors import (
     StopFailed,
 )
 from dualcal_hal.guard import READ_TIMEOUT
-from dualcal_hal.robot import JointPath, Joints, Motion, RobotState
+from dualcal_hal.robot import Joints, Motion, RobotState
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.journal import Left, Standing
 from procedures.observers import Observers
@@ -198,10 +198,11 @@ class Engine:
 
     def _move(self, arm: Arm, waypoints: tuple[Joints, ...]) -> RobotState:
         limits = arm.limits
-        path = JointPath(waypoints, tuple(map(float, limits.speed)), tuple(map(float, limits.acceleration)))
         start = self._read(arm)
+        path = self._cell.guard.path(arm.robot.name, start.positions, waypoints)
         ways = np.abs(np.diff([start.positions, *waypoints], axis=0))
-        needed = np.max(ways / limits.speed + limits.speed / limits.acceleration, axis=1).sum()
+        speed = np.array(path.speed)
+        needed = np.max(ways / speed + speed / limits.acceleration, axis=1).sum()
         # Known as moved before the command leaves: a failure from here on finds the arm among those to stop.
         self._moved.add(arm.robot.name)
         self._commanded[arm.robot.name] = waypoints[-1]

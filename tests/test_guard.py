@@ -63,7 +63,7 @@ def device():
 @pytest.fixture
 def guarded(device):
     robot = GuardedRobot(device, LIMITS, device.clock)
-    robot.admit(lambda path: None, threading.Lock())
+    robot.admit(lambda start, path: None, threading.Lock())
     return robot
 
 
@@ -146,7 +146,7 @@ def test_before_the_cell_is_put_together_nothing_moves(device):
 def test_the_whole_path_is_judged_from_where_the_arm_stands(device):
     judged = []
     robot = GuardedRobot(device, LIMITS, device.clock)
-    robot.admit(judged.append, threading.Lock())
+    robot.admit(lambda start, way: judged.append([start.positions, *way.waypoints]), threading.Lock())
     device.positions = (0.4, 0.4)
     robot.start(path((0.8, -0.4), (0.0, 0.0)))
     np.testing.assert_array_equal(judged, [[(0.4, 0.4), (0.8, -0.4), (0.0, 0.0)]])

@@ -49,6 +49,12 @@ class CellConfig(Section):
         return None if self.floor_mm is None else self.floor_mm / 1000
 
     @property
+    def corridor(self) -> float:
+        """How far (m) the arms' controllers may cut corners of a path: it is added to all clearance."""
+        used = {robot.backend for robot in self.robots.values()}
+        return max((getattr(self.backends[name].checked, "corridor", 0.0) for name in used), default=0.0)
+
+    @property
     def active_name(self) -> str:
         return self._name_by_role("active")
 

@@ -14,7 +14,8 @@ from typing import Any, Self, TypeVar
 from dualcal_hal.camera import Camera, Frame
 from dualcal_hal.cellfile import CellFile
 from dualcal_hal.clock import Clock, utc_now
-from dualcal_hal.errors import DualcalError, LogNotWritten
+from dualcal_hal.errors import DeviceError, DualcalError, LogNotWritten
+from dualcal_hal.findings import Finding
 from dualcal_hal.robot import JointPath, Joints, Motion, Robot, RobotState, StopResult
 from dualcal_hal.session.files import document_bytes
 from dualcal_hal.session.journal import StepKey
@@ -250,6 +251,21 @@ class _RecordedRobot(Robot):
 
         return _answered(recording, name, index, lambda: self._robot.subscribe(arrived), lambda _: None)
 
+    def on_failure(self, function: Callable[[DeviceError], None]) -> Callable[[], None]:
+        """Not recorded: what comes of it is, a stop or an error."""
+        return self._robot.on_failure(function)
+
+    @property
+    def keeps_speed(self) -> bool:
+        return self._robot.keeps_speed
+
+    @property
+    def confirmed_speed(self) -> float | None:
+        return self._robot.confirmed_speed
+
+    def findings(self) -> list[Finding]:
+        return self._robot.findings()
+
     def start(self, path: JointPath) -> Motion:
         recording, name = self._recording, self.name
         index = recording.call(name, "start", {"path": path}, recording.now())
@@ -299,6 +315,9 @@ class _RecordedCamera(Camera):
         self.name = camera.name
         self._camera = camera
         self._recording = recording
+
+    def findings(self) -> list[Finding]:
+        return self._camera.findings()
 
     def grab(self, not_before: float, timeout: float) -> Frame:
         recording = self._recording

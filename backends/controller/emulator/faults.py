@@ -33,6 +33,9 @@ FAULTS = {
 }
 """Names and what they do."""
 
+LASTING = {"lost-link": 3.0}
+"""Seconds that a fault lasts where nothing else is asked for; others last, or strike once."""
+
 GRAMMAR = "NAME[:ARM]@WHEN[~SECONDS]"
 
 _INTO_MOTION = 0.1  # s after an arm began to move that a fault within the motion comes
@@ -53,8 +56,8 @@ class Moment:
 
 @dataclass(frozen=True)
 class Fault:
-    """arm: which one it befalls, or None for both, or whichever it is that moves; seconds: how long it lasts, or None
-    for as the fault has it."""
+    """arm: which one it befalls, or None for both, or whichever it is that moves; seconds: how long it lasts, None for
+    a fault that stays or strikes once."""
 
     name: str
     arm: str | None
@@ -68,7 +71,7 @@ class Fault:
 def parse_fault(text: str, arms: Iterable[str]) -> Fault:
     """A fault as the command line has it; UsageError.
 
-    WHEN is seconds after the begin (``12.5``), or ``motion:3`` (0.1 s into the third motion of that arm, or of any where
+    WHEN is seconds after the begin (``12.5``), or ``motion:3`` (0.1 s into the third motion of that arm, or of any if
     none is named), or ``point:7`` (as its seventh trajectory point, or changed target, comes).
     """
     what, at, rest = text.partition("@")
@@ -81,7 +84,7 @@ def parse_fault(text: str, arms: Iterable[str]) -> Fault:
         raise UsageError(f"--fault {text}: there is no arm '{arm}', only {', '.join(known)}")
     if not at:
         raise UsageError(f"--fault {text}: say when, as {GRAMMAR}: {name}@12.5, {name}@motion:3 or {name}@point:7")
-    seconds = _positive(text, lasting) if tilde else None
+    seconds = _positive(text, lasting) if tilde else LASTING.get(name)
     return Fault(name, arm or None, _moment(text, when), seconds)
 
 

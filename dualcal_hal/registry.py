@@ -13,6 +13,7 @@ ENTRY_POINT_GROUP = "dualcal.backends"
 _BUILT_IN = {
     "replay": "backends.replay:ReplayBackend",
     "simulator": "backends.simulator:SimulatorBackend",
+    "zmq": "backends.cameras.zmq_backend:ZmqBackend",
 }
 
 

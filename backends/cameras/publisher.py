@@ -23,7 +23,7 @@ MOST_WAITING = 2
 HEARTBEAT_MS, SILENCE_MS = 500, 2000
 """How often either end is asked for a sign of life, and how long it may keep silent, ms."""
 
-_LARGEST_REQUEST = 256  # bytes
+_LARGEST_REQUEST = 1 << 11  # bytes; a handshake with keys takes some 500
 _MOST_REQUESTS = 256  # between two frames
 
 
@@ -79,7 +79,7 @@ class FramePublisher:
         return bool(self._topics)
 
     def publish(self, image: Image, exposed_at: float, sequence: int, exposure: float | None = None) -> None:
-        """Send one grey image (height, width) to all who listen, never waiting for them; it must not change any more.
+        """Send one grey image (height, width) to all who listen, never waiting for them.
 
         exposed_at: seconds of the real clock at the start of the exposure, or not later; exposure: s. Raises
         ValueError for what is no grey image.
@@ -99,7 +99,7 @@ class FramePublisher:
             height=height,
             marks=list(self._marks.items()),
         )
-        self._socket.send_multipart(encode(header, image), copy=False)
+        self._socket.send_multipart(encode(header, image))  # copied: not to is a thread more, for the process's life
 
     def _hear(self) -> None:
         """Take what listeners have asked for meanwhile; as much as may be, or one could keep all others waiting."""

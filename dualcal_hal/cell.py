@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from dualcal_hal.backend import Answer, Backend
 from dualcal_hal.camera import Camera
@@ -18,7 +18,7 @@ from dualcal_hal.geometry import CellGeometry
 from dualcal_hal.guard import CellGuard, GuardedRobot
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.limits import JointLimits
-from dualcal_hal.pace import REDUCED_SPEED, Pace
+from dualcal_hal.pace import FULL_PACE, REDUCED_SPEED, Pace
 from dualcal_hal.registry import backend_class
 from dualcal_hal.robot import Joints, Mode
 from dualcal_hal.session.log.recording import Recording
@@ -51,14 +51,13 @@ class Arm:
 class Cell:
     """Both arms and the camera, open; a context manager that closes what it opened, in reverse, on any exit."""
 
-    def __init__(self, cell: CellFile, share: float = 1.0, *, verified: bool = False) -> None:
+    def __init__(self, cell: CellFile, pace: Pace | None = None) -> None:
         """Refuses what the backends cannot serve; opens nothing yet.
 
-        share: of their speeds at which the arms move; verified: whether a calibration of this cell was, without which
-        no part of arms that are not simulated is faster than REDUCED_SPEED.
+        pace: how fast the arms may be; where left out as fast as they are if they are simulated, else reduced.
         """
         self._file = cell
-        self._share, self._verified = share, verified
+        self._pace = pace
         config = cell.cell
         used = {config.active.backend, config.passive.backend, config.camera.backend}
         types = {name: config.backends[name].type for name in config.backends if name in used}
@@ -94,7 +93,7 @@ class Cell:
                 config.procedure.clearance,
                 self.pace,
                 config.corridor,
-                watched=all(backend.time == "real" for backend in self._backends.values()),
+                watched=self.time == "real",
             )
             self._devices = opening.pop_all()
         return self
@@ -163,7 +162,14 @@ class Cell:
     @property
     def pace(self) -> Pace:
         """How fast its arms may be."""
-        return Pace(self._share, None if self.simulated or self._verified else REDUCED_SPEED)
+        if self._pace is not None:
+            return self._pace
+        return FULL_PACE if self.simulated else Pace(largest=REDUCED_SPEED)
+
+    @property
+    def time(self) -> Literal["drives", "real"]:
+        """Whether its backends make time or live in it."""
+        return "real" if all(backend.time == "real" for backend in self._backends.values()) else "drives"
 
     @property
     def simulated(self) -> bool:

@@ -4,6 +4,7 @@
     ├── CellFileError (ValueError)          the cell file, or a value given with --set
     ├── FormatError (ValueError)            a public file (captures, result, session) that cannot be read
     ├── UsageError (ValueError)             a call that cannot be carried out as asked
+    │   └── NotConfirmed                    the operator does not want what was shown
     ├── DegenerateCaptures (ValueError)     captures that do not determine what is sought
     ├── NoPlan (RuntimeError)               no poses or no way that keep all conditions
     ├── LogMissing (LookupError)            a folder or file that holds no log
@@ -68,6 +69,10 @@ class FormatError(_WithProblems, ValueError):
 
 class UsageError(DualcalError, ValueError):
     """The call cannot be carried out as it was asked."""
+
+
+class NotConfirmed(UsageError):
+    """The operator was asked, and did not agree."""
 
 
 class DegenerateCaptures(DualcalError, ValueError):

@@ -36,6 +36,7 @@ from procedures.events import (
     BeliefRefined,
     ConstraintDone,
     ConstraintGivenUp,
+    LooksProposed,
     LookTaken,
     NominalContradicted,
     NotHome,
@@ -54,7 +55,7 @@ from procedures.planning.refine import LEAST_VIEWS, WORST_FIT, View, arrival_sca
 from procedures.planning.sight import require_visible
 from procedures.planning.ways import WayFinder
 from procedures.seeing import see
-from procedures.steps import Believe, KeepDocument, KeepImage, Procedure, task, tell, work
+from procedures.steps import Believe, Confirm, KeepDocument, KeepImage, Procedure, task, tell, work
 
 _TRIES_A_LOOK = 20
 NO_WAY_TO_LOOK = "no clear way leads there"
@@ -156,6 +157,7 @@ class Calibration:
         tolerance_px(model, cell.procedure.tolerance_px)
         self._belief = model.nominal
         self._views: list[View] = []
+        self._looks_confirmed = self._plan_confirmed = False
         self._retreats: list[Posture] = [model.home]
         self._ways = WayFinder(model, self._belief, self._retreats)
 
@@ -211,7 +213,32 @@ class Calibration:
         asked = {"from": start.to_record()}
         return (yield from work("stand-off", asked, find, StandOffRecord.to_record, self._stand_off_from))
 
+    def _confirm_looks(self, stand_off: Posture) -> Procedure[None]:
+        """Before the first move that this program makes for the looks."""
+        if self._looks_confirmed:
+            return
+
+        def proposed() -> Procedure[LooksProposed]:
+            way = self._ways.find((yield from here()), stand_off)
+            return LooksProposed(stand_off, way, self._procedure.first_looks)
+
+        yield Confirm(proposed)
+        self._looks_confirmed = True
+
+    def _confirm_plan(self) -> Procedure[None]:
+        """Before the first move that this program makes by the plan."""
+        if self._plan_confirmed:
+            return
+
+        def planned() -> Procedure[PlanReady]:
+            yield from ()
+            return PlanReady(self._plan)
+
+        yield Confirm(planned)
+        self._plan_confirmed = True
+
     def _look(self, stand_off: Posture, number: int) -> Procedure[LookRecord]:
+        yield from self._confirm_looks(stand_off)
         reason, taken = "no posture for it keeps clear and shows the target", 0
         refused: Counter[str] = Counter()
         postures = look_postures(self._model, self._belief, self._ways, stand_off, number, refused)
@@ -305,6 +332,7 @@ class Calibration:
             key = StepKey(constraint.use, constraint.name, i, "point")
 
             def body(i: int = i, near: Joints = planned.passive, goal: Array = T_P_T) -> Procedure[PointRecord]:
+                yield from self._confirm_plan()
                 alignment = yield from aligner.align(constraint.active, near, goal, T_P_E)
                 return (yield from self._captured(constraint, i, alignment, aligner))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,6 +17,7 @@ from dualcal_hal.errors import (
     FormatError,
     Interrupted,
     LogDamaged,
+    NotConfirmed,
     Problem,
     StopFailed,
 )
@@ -27,6 +29,7 @@ from procedures.observers import Observers
 from procedures.steps import (
     ArmReading,
     Believe,
+    Confirm,
     KeepDocument,
     KeepImage,
     Look,
@@ -50,10 +53,18 @@ LATE_FACTOR, LATE_MARGIN = 2.0, 5.0
 _ARRIVAL_SIGMAS = 8
 
 
+Confirmation = Callable[[Callable[[], object], Callable[[], bool]], bool]
+"""Whether the operator agrees to what is shown; looks now and then whether the run was aborted."""
+
+
 class Engine:
     """Runs a procedure's steps on an open cell, and stops every arm it has moved on any exit."""
 
-    def __init__(self, cell: Cell, session: Session, observers: Observers) -> None:
+    def __init__(
+        self, cell: Cell, session: Session, observers: Observers, confirm: Confirmation = lambda shown, aborted: True
+    ) -> None:
+        """``confirm`` asks the operator; it gets what is to be shown, and what says whether the run was aborted."""
+        self._confirm = confirm
         self._cell = cell
         self._recording = cell.recording
         self._session = session
@@ -149,11 +160,19 @@ class Engine:
             case KeepDocument(file_name, document):
                 self._session.write_document(file_name, document)
                 self._recording.document(file_name, document)
+            case Confirm(body):
+                self._ask(lambda: self._drive(body()))
             case Believe(placement, geometry, T_H_E):
                 self._recording.belief(placement.T_P_A, T_H_E)
                 self._cell.guard.place(placement, geometry)
             case _:
                 raise TypeError(f"{step!r} is no step")
+
+    def _ask(self, shown: Callable[[], object]) -> None:
+        agreed = self._confirm(shown, lambda: self._abort_reason is not None)
+        self._raise_if_aborted()
+        if not agreed:
+            raise NotConfirmed("not confirmed by the operator: no arm is moved any further")
 
     def _task(self, task: Task) -> Any:
         finished = self._session.journal.result(task.key)

@@ -6,12 +6,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from procedures.planning.model import Posture
 from procedures.planning.plan import Plan
+from procedures.planning.ways import Leg
 
 
 def counted(count: int, thing: str) -> str:
     """``1 picture``, ``2 pictures``."""
     return f"{count} {thing}" + ("" if count == 1 else "s")
+
+
+@dataclass(frozen=True)
+class LooksProposed:
+    """Where the first looks are to be taken from.
+
+    way: the moves that lead there, None if none was found; count: how many looks there will be, by moves of the wrists.
+    """
+
+    stand_off: Posture
+    way: tuple[Leg, ...] | None
+    count: int
 
 
 @dataclass(frozen=True)

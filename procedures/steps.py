@@ -119,6 +119,16 @@ class Tell:
 
 
 @dataclass(frozen=True, eq=False)
+class Confirm:
+    """Have the operator agree to what comes next, on a cell where that is asked for; NotConfirmed is thrown in if not.
+
+    body: gives what the operator is shown; it is run only where somebody looks at it.
+    """
+
+    body: Callable[[], Procedure[object]]
+
+
+@dataclass(frozen=True, eq=False)
 class Task:
     """A part of the procedure whose result is journalled under ``key`` when it is finished.
 

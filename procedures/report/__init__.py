@@ -2,7 +2,15 @@
 
 from procedures.report.plan_picture import draw_plan
 from procedures.report.summary import draw_summary
-from procedures.report.tables import error_table, mismatch_table, outcome, plan_table, result_tables, way_table
+from procedures.report.tables import (
+    error_table,
+    mismatch_table,
+    outcome,
+    plan_table,
+    posture_table,
+    result_tables,
+    way_table,
+)
 
 __all__ = [
     "draw_plan",
@@ -11,6 +19,7 @@ __all__ = [
     "mismatch_table",
     "outcome",
     "plan_table",
+    "posture_table",
     "result_tables",
     "way_table",
 ]

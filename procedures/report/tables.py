@@ -14,6 +14,7 @@ from dualcal_hal.config import CellConfig
 from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Mismatch, Result, TruthError
 from dualcal_hal.transforms import Array
 from procedures.planning.choice import LEAST_SPREAD
+from procedures.planning.model import Posture
 from procedures.planning.plan import Plan, PlannedConstraint
 from procedures.planning.ways import Leg
 from procedures.report.nominal_errors import (
@@ -114,6 +115,15 @@ def way_table(legs: Sequence[Leg]) -> Table:
         for i, waypoint in enumerate(leg.waypoints):
             angles = (f"{angle:.1f}" for angle in np.degrees(waypoint))
             table.add_row(str(number) if i == 0 else "", Text(leg.arm), *angles)
+    return table
+
+
+def posture_table(posture: Posture) -> Table:
+    """Where both arms are to stand."""
+    joints = max(len(posture.active), len(posture.passive))
+    table = _table("Posture, joints in deg", "arm", *(f"q{i}" for i in range(1, joints + 1)))
+    for arm, angles in (("active", posture.active), ("passive", posture.passive)):
+        table.add_row(arm, *(f"{angle:.1f}" for angle in np.degrees(angles)))
     return table
 
 

@@ -43,6 +43,19 @@ def run(
         bool, typer.Option("--dry-run", help="Show stand-off, looks and a provisional plan only.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Move without asking, on a cell that is not simulated.")] = False,
+    speed: Annotated[
+        float, typer.Option(min=0.05, max=1.0, help="Share of the arms' speed; below all other limits.")
+    ] = 1.0,
+    enable: Annotated[
+        bool, typer.Option("--enable", help="Switch the drives on first, where that ends with the program (CAN).")
+    ] = False,
+    emulate: Annotated[
+        bool, typer.Option("--emulate", help="Start an emulator of the cell's devices beside the run; end it with it.")
+    ] = False,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option("--fault", metavar="NAME@WHEN", help="A fault of that emulator, see dualcal emulate --help."),
+    ] = None,
     log: Annotated[
         bool, typer.Option("--log/--no-log", help="Record all that passes between program and devices.")
     ] = True,
@@ -56,7 +69,24 @@ def run(
     with ended_in_order():
         from tools.cli.run import RunOptions, run_cell
 
-        code = run_cell(RunOptions(cell, out, seed, method, tuple(overrides or ()), dry_run, yes, log, json, resume))
+        code = run_cell(
+            RunOptions(
+                cell=cell,
+                out=out,
+                seed=seed,
+                method=method,
+                overrides=tuple(overrides or ()),
+                dry_run=dry_run,
+                yes=yes,
+                log=log,
+                json=json,
+                resume=resume,
+                speed=speed,
+                emulate=emulate,
+                enable=enable,
+                faults=tuple(fault or ()),
+            )
+        )
     raise typer.Exit(code)
 
 

@@ -60,7 +60,8 @@ def estimate_captures(options: EstimateOptions) -> None:
         said = f"{len(unfinished)} captures left out, the first {unfinished[0].id}: {unfinished[0].reason}"
         rejected = (*result.captures_rejected, *unfinished)
         result = replace(result, captures_rejected=rejected, reasons=(*result.reasons, said))
-    truth = _truth(options.truth, file if ours else None)
+    folder = options.captures if options.captures.is_dir() else options.captures.parent
+    truth = _truth(options.truth, file if ours else None, folder)
     if truth is not None:
         result = with_truth_error(result, truth)
     if options.out is not None:
@@ -140,7 +141,7 @@ def _detected_anew(
     return anew.captures, anew.missed
 
 
-def _truth(path: Path | None, file: CellFile | None) -> Mapping[str, Array] | None:
+def _truth(path: Path | None, file: CellFile | None, folder: Path) -> Mapping[str, Array] | None:
     if path is not None:
         return read_truth(path)
-    return None if file is None else simulated_truth(file)
+    return None if file is None else simulated_truth(file, folder)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import Self
 
@@ -26,6 +27,11 @@ class Lines:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         pass
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Nothing is in the way of a question between lines."""
+        yield
 
     def __call__(self, event: object) -> None:
         self._console.print(str(event), highlight=False, soft_wrap=True)
@@ -57,6 +63,13 @@ class Bars:
     ) -> None:
         with suppress(OSError):  # the terminal may be gone
             self._bars.stop()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """The bars are taken off the screen while this lasts."""
+        self._bars.stop()
+        yield
+        self._bars.start()
 
     def __call__(self, event: object) -> None:
         match event:

@@ -27,6 +27,7 @@ from dualcal_hal.errors import (
     UsageError,
 )
 from dualcal_hal.session.comparison import Comparison, compare_captures, compare_results
+from dualcal_hal.session.conduct import read_conduct
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.journal import Journal, StepKey
 from dualcal_hal.session.log import LogReader
@@ -38,6 +39,7 @@ from procedures.planning.model import CellModel
 from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.run import analyse_session, execute, write_session_captures
 from tools.cli.terminal import Screen
+from tools.cli.truth import simulated_truth
 
 _NO_END_OF_A_RUN = (ReplayMismatch, FrameMissing, LogDamaged, Interrupted)
 """Errors that say that the replay failed, and not that the recorded run ended so."""
@@ -103,6 +105,11 @@ def _load(session: Path) -> CellFile:
     return load_cell(path, instead={"type": "replay", "session": str(session.absolute())})
 
 
+def _as_recorded(session: Path) -> CellFile:
+    """The session's cell as it was run, whether or not its backends are installed here."""
+    return load_cell(session / "cell.yaml", meshes=False, backends=False)
+
+
 class _PassingSession(Session):
     """A session whose folder is thrown away: nobody will look at its images."""
 
@@ -124,14 +131,15 @@ def _replay(recorded: Path, file: CellFile, session: Session) -> Replayed:
     segments = begun_segments(recorded)
     log, journal = FinishedAttempts(segments), Journal(recorded / "journal.jsonl")
     _require_all_steps(recorded, log, journal)
-    cell, calibration = Cell(file), Calibration(file.cell, CellModel(file.cell))
+    conduct = read_conduct(Session(recorded))
+    cell, calibration = Cell(file, conduct.pace), Calibration(file.cell, CellModel(file.cell))
     begun = perf_counter()
     result, error = None, None
     try:
         with signals_deferred() as signals:
             execute(cell, calibration, session, lambda event: None, lambda engine: signals.pass_on_to(engine.abort))
         captures = write_session_captures(file, session)
-        analyse_session(file, session, captures)
+        analyse_session(file, session, captures, simulated_truth(_as_recorded(recorded), recorded))
         # Read as the recorded one is: what is compared is what the files say.
         result = read_result(session.result_path)
     except _NO_END_OF_A_RUN:

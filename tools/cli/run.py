@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -17,25 +17,31 @@ from dualcal_hal.camera import Image
 from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import CellFile, differences, load_cell, standing_alone
 from dualcal_hal.clock import utc_now
+from dualcal_hal.commissioning import Commissioning
 from dualcal_hal.config import CellConfig
-from dualcal_hal.errors import FormatError, Problem, UsageError
+from dualcal_hal.errors import FormatError, NotConfirmed, Problem, UsageError
+from dualcal_hal.pace import REDUCED_SPEED, Pace
 from dualcal_hal.session.captures import CaptureRecord, Captures, CellShape, write_captures
+from dualcal_hal.session.conduct import Conduct, keep_conduct
 from dualcal_hal.session.distances import DISTANCES, Distances, read_distances
 from dualcal_hal.session.folder import CELL_FILE, Session
 from dualcal_hal.session.lock import SessionLock
 from dualcal_hal.session.log import next_segment
 from dualcal_hal.session.log.recording import LogRecording, Recording
 from dualcal_hal.session.result import Result, read_result, with_truth_error, write_result
+from dualcal_hal.transforms import Array
 from procedures.alignment import largest_alignment_error, tolerance_px
 from procedures.analysis import analyse
 from procedures.calibrate import Calibration, captures_of, is_complete
-from procedures.engine import Engine
+from procedures.engine import Confirmation, Engine
 from procedures.observers import Observer, Observers
 from procedures.planning.model import CellModel
 from procedures.planning.plan import PLAN_FORMAT, Plan
 from procedures.rehearsal import rehearse, require_reach
 from procedures.report import draw_plan, draw_summary
+from tools.cli.emulator import emulator
 from tools.cli.exits import FAULT, signals_deferred
+from tools.cli.operator import Operator
 from tools.cli.progress import progress
 from tools.cli.show import show_rehearsal, show_result
 from tools.cli.terminal import Screen, plain
@@ -58,6 +64,10 @@ class RunOptions:
     log: bool = True
     json: bool = False
     resume: Path | None = None
+    speed: float = 1.0
+    emulate: bool = False
+    enable: bool = False
+    faults: tuple[str, ...] = ()
 
 
 def run_cell(options: RunOptions) -> int:
@@ -71,22 +81,27 @@ def run_cell(options: RunOptions) -> int:
     file = _load(options, options.cell)
     model = CellModel(file.cell)
     calibration = Calibration(file.cell, model)
-    cell = Cell(file)
+    cell = _cell(options, file, options.cell)
     _warn_of_alignment_error(console, file, model)
     if options.dry_run:
         _rehearse(console, file, model, options)
         return 0
     require_reach(file.cell, model)
-    _confirm(cell, options.yes)
+    commissioning = _commissioned(cell, options, file, options.cell)
     started = utc_now()
     text, copies = standing_alone(file)
     folder = options.out or _unused_folder(started, file.cell.name)
     session = Session.create(folder, text, started.isoformat(timespec="seconds"), copies)
     with _kept(session), SessionLock(session.folder):
+        keep_conduct(session, Conduct(cell.pace, options.emulate))
+        if commissioning is not None:
+            commissioning.copy_beside(session.cell_path)
         if text != file.text:
             file = load_cell(session.cell_path)
-            calibration, cell = Calibration(file.cell, CellModel(file.cell)), Cell(file)
-        return _report(console, options, file, session, _finish(console, options, file, cell, calibration, session))
+            calibration = Calibration(file.cell, CellModel(file.cell))
+            cell = Cell(file, cell.pace)
+        result = _finish(console, options, file, cell, calibration, session)
+        return _report(console, options, file, session, result, commissioning)
 
 
 def _resume(console: Console, options: RunOptions, folder: Path) -> int:
@@ -108,12 +123,14 @@ def _resume(console: Console, options: RunOptions, folder: Path) -> int:
                 _say(console, "all is captured already: only the analysis is left, and no arm is moved")
                 write_captures(session.captures_path, captures)
                 result = conclude(file, session, captures, lambda line: _say(console, line))
+                commissioning = None
             else:
                 model = CellModel(file.cell)
-                calibration, cell = Calibration(file.cell, model), Cell(file)
-                _confirm(cell, options.yes)
+                calibration, cell = Calibration(file.cell, model), _cell(options, file, session.cell_path)
+                commissioning = _commissioned(cell, options, file, session.cell_path)
+                keep_conduct(session, Conduct(cell.pace, options.emulate))
                 result = _finish(console, options, file, cell, calibration, session)
-            return _report(console, options, file, session, result)
+            return _report(console, options, file, session, result, commissioning)
 
 
 def _file_of(options: RunOptions, folder: Path) -> CellFile:
@@ -140,12 +157,23 @@ def _finish(
 ) -> Result:
     """Run from where the session's journal ends, and analyse."""
     go_on_from_journal(cell, session)
-    with _recording(options, session, file, cell) as recording:
+    with _recording(options, session, file, cell) as recording, _devices(options, cell, session):
         cell.record(recording)
-        captures = _run(console, file, cell, calibration, session)
+        captures = _run(console, options, file, cell, calibration, session)
         result = conclude(file, session, captures, lambda line: _say(console, line))
         recording.document(session.result_path.name, result.to_document())
     return result
+
+
+@contextmanager
+def _devices(options: RunOptions, cell: Cell, session: Session) -> Iterator[None]:
+    """The cell's devices are those of an emulator beside it while this lasts, if that is asked for."""
+    if not options.emulate:
+        yield
+        return
+    with emulator(session.cell_path, options.faults) as endpoints:
+        cell.use_emulator(endpoints)
+        yield
 
 
 def go_on_from_journal(cell: Cell, session: Session) -> None:
@@ -157,11 +185,21 @@ def go_on_from_journal(cell: Cell, session: Session) -> None:
         raise FormatError([Problem(f"{where}: {each.where}", each.what) for each in error.problems]) from error
 
 
-def _report(console: Console, options: RunOptions, file: CellFile, session: Session, result: Result) -> int:
+def _report(
+    console: Console,
+    options: RunOptions,
+    file: CellFile,
+    session: Session,
+    result: Result,
+    commissioning: Commissioning | None = None,
+) -> int:
+    """Show what came of it; a calibration that was verified is kept in the cell's commissioning."""
     if options.json:
         typer.echo(plain(session.result_path.read_text()), nl=False)
     else:
-        show_result(console, file.cell, result, simulated_truth(file), as_json=False)
+        show_result(console, file.cell, result, simulated_truth(file, session.folder), as_json=False)
+    if commissioning is not None and result.verdict == "ok":
+        commissioning.record_verified(f"verdict {result.verdict} of session {session.folder.name}")
     if (distances := read_distances(session)) is not None:
         _say(console, f"least distance between the arms {distances.least()}")
     _say(console, f"session: {session.folder}")
@@ -188,12 +226,23 @@ def _recording(options: RunOptions, session: Session, file: CellFile, cell: Cell
     return LogRecording(next_segment(session.folder), file, cell.clock) if options.log else Recording()
 
 
-def _run(console: Console, file: CellFile, cell: Cell, calibration: Calibration, session: Session) -> Captures:
+def _run(
+    console: Console, options: RunOptions, file: CellFile, cell: Cell, calibration: Calibration, session: Session
+) -> Captures:
     """The run itself; its captures are written however it ends."""
     with signals_deferred() as signals:
         try:
             with progress(console) as watcher:
-                execute(cell, calibration, session, watcher, lambda engine: signals.pass_on_to(engine.abort))
+                operator = Operator(console, watcher, asked=not (cell.simulated or options.yes))
+                execute(
+                    cell,
+                    calibration,
+                    session,
+                    watcher,
+                    lambda engine: signals.pass_on_to(engine.abort),
+                    operator.confirms,
+                    prepare=lambda opened: _prepare(console, options, opened, operator),
+                )
         except BaseException as error:
             try:
                 write_session_captures(file, session)
@@ -253,11 +302,17 @@ def execute(
     session: Session,
     watcher: Observer,
     begun: Callable[[Engine], None] = lambda engine: None,
+    confirm: Confirmation = lambda shown, aborted: True,
+    prepare: Callable[[Cell], None] = lambda cell: None,
 ) -> None:
-    """Run the procedure on the cell's devices, which are closed again on any exit; ``begun`` gets the engine."""
+    """Run the procedure on the cell's devices, which are closed again on any exit.
+
+    ``begun`` gets the engine; ``confirm`` asks the operator; ``prepare`` is done once the devices are open.
+    """
     with Observers(watcher) as observers, cell as opened:
-        engine = Engine(opened, session, observers)
+        engine = Engine(opened, session, observers, confirm)
         begun(engine)
+        prepare(opened)
         with _documents_kept(opened, session):
             engine.run(calibration.steps())
 
@@ -292,7 +347,7 @@ def conclude(
 
     ``say`` gets a line for each part of the picture that cannot be drawn, as a file of the session is missing.
     """
-    result = analyse_session(file, session, captures)
+    result = analyse_session(file, session, captures, simulated_truth(file, session.folder))
     shown = captures.captures[0]
     image, plan = _image_of(session, shown, say), None
     if (session.folder / PLAN_FILE).exists():
@@ -330,21 +385,44 @@ def _read_plan(session: Session, cell: CellConfig) -> Plan:
     return plan
 
 
-def analyse_session(file: CellFile, session: Session, captures: Captures) -> Result:
+def analyse_session(file: CellFile, session: Session, captures: Captures, truth: Mapping[str, Array] | None) -> Result:
     """The result, with its error where there is a truth, written to the session."""
     result = analyse(captures, file.cell, file.cell.procedure.method)
-    truth = simulated_truth(file)
     if truth is not None:
         result = with_truth_error(result, truth)
     write_result(session.result_path, result)
     return result
 
 
-def _confirm(cell: Cell, yes: bool) -> None:
-    if cell.simulated or yes:
+def _cell(options: RunOptions, file: CellFile, path: Path) -> Cell:
+    """The cell of ``path``, its devices not open yet, at the pace that its commissioning and ``--speed`` allow."""
+    cell = Cell(file)
+    if options.emulate and cell.time != "real":
+        raise UsageError("--emulate puts an emulator behind real wires; this cell has its own simulator: go without")
+    if options.faults and not options.emulate:
+        raise UsageError("--fault is for the emulator: it goes with --emulate")
+    free = cell.simulated or options.emulate or Commissioning.of(path, file).verified
+    return Cell(file, Pace(options.speed, None if free else REDUCED_SPEED))
+
+
+def _commissioned(cell: Cell, options: RunOptions, file: CellFile, path: Path) -> Commissioning | None:
+    """The record of a cell that is not simulated; UsageError if its arms must not be moved yet."""
+    if cell.simulated or options.emulate:
+        return None
+    commissioning = Commissioning.of(path, file)
+    if missing := commissioning.missing():
+        raise UsageError("\n".join(["this cell is not simulated, and its arms must not be moved yet:", *missing]))
+    return commissioning
+
+
+def _prepare(console: Console, options: RunOptions, cell: Cell, operator: Operator) -> None:
+    """What the operator wants done before the procedure begins, once the devices are open."""
+    if not (options.enable or options.emulate):
         return
-    if not typer.confirm("This cell is not simulated: both arms will move. Go on?", default=False):
-        raise UsageError("not confirmed; nothing was moved")
+    if not operator.agrees("Switch the drives of both arms on?"):
+        raise NotConfirmed("not confirmed by the operator: the drives were left as they are")
+    for name in cell.enable_arms():
+        _say(console, f"{name}: its drives are on")
 
 
 def _warn_of_alignment_error(console: Console, file: CellFile, model: CellModel) -> None:

@@ -3,14 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
+from dualcal_hal import registry
 from dualcal_hal.cellfile import CellFile
+from dualcal_hal.errors import UsageError
+from dualcal_hal.session.conduct import read_conduct
+from dualcal_hal.session.folder import Session
 from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME
 from dualcal_hal.transforms import Array
 
 
-def simulated_truth(file: CellFile) -> Mapping[str, Array] | None:
-    """The true transforms by their public names, or None for a cell without simulation."""
-    if file.simulation is None:
+def simulated_truth(file: CellFile, session: Path) -> Mapping[str, Array] | None:
+    """The true transforms by their public names, or None where what was run is no simulated cell.
+
+    session: the folder of the run, which says whether its devices were those of an emulator, which simulates what the
+    cell file says; any other folder for captures without one.
+    """
+    if file.simulation is None or not (_is_simulated(file) or read_conduct(Session(session)).emulated):
         return None
     return {T_P_A_NAME: file.simulation.truth.T_P_A, T_H_E_NAME: file.simulation.truth.T_H_E}
+
+
+def _is_simulated(file: CellFile) -> bool:
+    cell = file.cell
+    used = {cell.active.backend, cell.passive.backend, cell.camera.backend}
+    try:
+        return all(registry.backend_class(cell.backends[name].type).simulated for name in used)
+    except (UsageError, ImportError):  # one that is not installed here; none that simulates is missing
+        return False

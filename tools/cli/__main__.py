@@ -1,0 +1,5 @@
+"""``python -m tools.cli``: the same as ``dualcal``."""
+
+from tools.cli import main
+
+main()

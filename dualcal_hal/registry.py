@@ -11,6 +11,7 @@ from dualcal_hal.errors import UsageError
 ENTRY_POINT_GROUP = "dualcal.backends"
 
 _BUILT_IN = {
+    "controller": "backends.controller:ControllerBackend",
     "replay": "backends.replay:ReplayBackend",
     "simulator": "backends.simulator:SimulatorBackend",
     "zmq": "backends.cameras.zmq_backend:ZmqBackend",

@@ -10,6 +10,7 @@ import numpy as np
 from backends.simulator.noise import Key, generator
 from dualcal_hal.geometry import link_capsules
 from dualcal_hal.kinematics import Chain, Row
+from dualcal_hal.robot import Joints
 from dualcal_hal.transforms import Array, rotation_from_vector, transform
 
 if TYPE_CHECKING:
@@ -112,6 +113,11 @@ def true_chain(name: str, known: Chain, errors: MechanicalErrorsConfig, seed: in
             )
         )
     return Chain(tuple(rows))
+
+
+def unseen_error(seed: int, arm: str, target: Joints, sigma: float) -> Array:
+    """(n,) rad, of that standard deviation, by which an arm that was sent to ``target`` stands from what is read."""
+    return np.asarray(sigma * generator(seed, arm, "joint error", *target).standard_normal(len(target)))
 
 
 def directions(*key: Key) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 
 from backends.simulator.arm import SimulatedArm
 from backends.simulator.left import CellLeft
+from backends.simulator.mechanics import unseen_error
 from backends.simulator.noise import generator
 from backends.simulator.stepper import Stepper, stepper_class
 from backends.simulator.truth import Truth
@@ -49,8 +50,7 @@ class World:
 
     def joint_error(self, arm: str, target: Joints) -> Array:
         """(n,) rad that the encoders do not see, of an arm that was sent to ``target``: always the same."""
-        drawn = generator(self._seed, arm, "joint error", *target).standard_normal(len(target))
-        return np.asarray(self.noise.joint * drawn)
+        return unseen_error(self._seed, arm, target, self.noise.joint)
 
     def sample_noise(self, device: str, stream: str) -> np.random.Generator:
         """The source of noise for the device's next sample of ``stream`` (call under the lock).

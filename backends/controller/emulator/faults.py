@@ -183,7 +183,7 @@ class FaultSchedule:
             if self._closed:
                 return
         now = self._clock.now()
-        undo = [end for begin in self._of(fault, mover) if (end := begin()) is not None]
+        undo = [back for begin in self._of(fault, mover) if (back := begin()) is not None]
         self._say(f"fault: {fault}, at {fault.when}, {now:.6f} s of the clock")
         if fault.seconds is None or not undo:
             return

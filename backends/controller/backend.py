@@ -17,6 +17,7 @@ from dualcal_hal.camera import Camera
 from dualcal_hal.clock import RealClock
 from dualcal_hal.errors import CellFileError, Problem, UnknownDevice, UsageError
 from dualcal_hal.limits import JointLimits
+from dualcal_hal.robot import Joints
 
 if TYPE_CHECKING:
     from dualcal_hal.cellfile import CellFile
@@ -83,11 +84,16 @@ class ControllerBackend(Backend):
         if self._link.tcp is not None:
             from backends.controller import tcp
 
-            return tcp.links(self._link.tcp, joints, self._clock)
+            return tcp.links(self._link.tcp, joints, self._clock, self._top_speeds())
         assert self._link.can is not None
         from backends.controller import can
 
         return can.links(self._link.can, joints, self._clock)
+
+    def _top_speeds(self) -> dict[str, Joints]:
+        """The most that each arm's controller's joints can, rad/s."""
+        limits = {arm: JointLimits.of(self.cell.cell.robots[arm]).speed for arm in self._maps}
+        return {arm: tuple(self._maps[arm].bound_to_controller(speed).tolist()) for arm, speed in limits.items()}
 
 
 def _joint_maps(name: str, cell: CellFile, link: Link) -> dict[str, JointMap]:

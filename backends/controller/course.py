@@ -31,10 +31,8 @@ class Course:
         self.waypoints: tuple[Joints, ...] = tuple(
             _joints(joint_map.to_controller(np.array(w))) for w in path.waypoints
         )
-        self.speed, self.acceleration = (
-            np.abs(joint_map.velocity_to_controller(np.diag(bound))).sum(axis=0)
-            for bound in (np.array(path.speed), self._acceleration)
-        )
+        self.speed = joint_map.bound_to_controller(np.array(path.speed))
+        self.acceleration = joint_map.bound_to_controller(self._acceleration)
 
     def sample(self, t: float) -> tuple[Array, Array]:
         """Where the joints (n,) are to be ``t`` s after the begin, rad, and their velocities (n,), rad/s."""

@@ -92,6 +92,10 @@ class JointMap:
         """Velocities (..., n), rad/s."""
         return np.asarray(v @ self._linear.T)
 
+    def bound_to_controller(self, bound: Array) -> Array:
+        """The most (n,) that the controller's joints come to where those of the kinematics keep below ``bound``."""
+        return np.asarray(np.abs(self._linear) @ bound)
+
     def velocity_from_controller(self, v: Array) -> Array:
         """And back."""
         return np.asarray(v @ self._inverse.T)

@@ -7,7 +7,6 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
 from itertools import pairwise
-from typing import ClassVar
 
 from backends.cameras.driver import Driver
 from dualcal_hal.camera import Frame, Image
@@ -35,18 +34,20 @@ class _Request:
 class Stream(Driver):
     """``serve`` begins the thread, which calls :meth:`receive` again and again."""
 
-    proof: ClassVar[str]
-    """How it is known when an exposure began, for an operator."""
-
     def __init__(self, name: str, clock: Clock) -> None:
         self.name = name
         self.clock = clock
         self.arrivals: deque[float] = deque(maxlen=_COUNTED)
+        self.ending = threading.Event()
         self._lock = threading.Lock()
         self._request: _Request | None = None
         self._down: Callable[[], DeviceError] | None = None
-        self._ending = threading.Event()
         self._thread = threading.Thread(target=self._serve, name=f"frames of {name}", daemon=True)
+
+    @property
+    @abstractmethod
+    def proof(self) -> str:
+        """How it is known when an exposure began, for an operator."""
 
     @abstractmethod
     def receive(self) -> None:
@@ -74,8 +75,13 @@ class Stream(Driver):
         return request.frame
 
     def close(self) -> None:
-        self.set_down(lambda: NotOpen(self.name, "grab", "it was closed meanwhile", "open its backend again"))
-        self._ending.set()
+        def closed() -> DeviceError:
+            return NotOpen(self.name, "grab", "it was closed meanwhile", "open its backend again")
+
+        with self._lock:
+            self.ending.set()
+            self._down = closed
+        self.refuse(closed())
         if self._thread.is_alive():
             self._thread.join()
 
@@ -91,9 +97,13 @@ class Stream(Driver):
         if earliest < request.not_before:
             request.too_early += 1
             return
-        picture = image()
-        picture.setflags(write=False)
-        request.frame = Frame(picture, earliest, sequence)
+        try:
+            picture = image()
+        except DeviceError as error:
+            request.error = error
+        else:
+            picture.setflags(write=False)
+            request.frame = Frame(picture, earliest, sequence)
         self._answered(request)
 
     def refuse(self, error: DeviceError) -> None:
@@ -107,7 +117,7 @@ class Stream(Driver):
     def set_down(self, error: Callable[[], DeviceError] | None) -> None:
         """No frame comes from here on, to whoever waits or asks; with None they come again."""
         with self._lock:
-            if self._ending.is_set():
+            if self.ending.is_set():
                 return
             self._down = error
         if error is not None:
@@ -122,7 +132,7 @@ class Stream(Driver):
 
     def _serve(self) -> None:
         try:
-            while not self._ending.is_set():
+            while not self.ending.is_set():
                 self.receive()
         except BaseException as error:
             why = f"an error of this program ended the taking of frames: {error!r}"

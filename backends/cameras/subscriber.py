@@ -42,8 +42,6 @@ _ADVICE = "check that dualcal serve-camera runs there, and network and keys"
 class Subscriber(Stream):
     """Listens to ``endpoint`` and takes frames of the camera of that name, and of no other."""
 
-    proof = "time stamps of the sender"
-
     def __init__(self, name: str, clock: Clock, endpoint: str, camera: str, keys: ClientKeys | None) -> None:
         """UsageError for keys that cannot be read; waits for nothing."""
         super().__init__(name, clock)
@@ -67,6 +65,10 @@ class Subscriber(Stream):
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
         self._poller.register(self._monitor, zmq.POLLIN)
+
+    @property
+    def proof(self) -> str:
+        return "the sender's time stamps"
 
     def await_first(self, timeout: float) -> None:
         """Wait for a frame.

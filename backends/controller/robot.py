@@ -14,7 +14,7 @@ from backends.controller.following import STANDS_FOR, Following, Standing
 from backends.controller.joint_map import JointMap
 from backends.controller.link import ArmLink, ArmReport, Transfer
 from dualcal_hal.clock import Clock
-from dualcal_hal.errors import CommandRefused, DeviceError, MotionFailed, NotOpen
+from dualcal_hal.errors import CommandRefused, DeviceError, DeviceTimeout, MotionFailed, NotOpen
 from dualcal_hal.findings import Finding
 from dualcal_hal.limits import JointLimits
 from dualcal_hal.robot import JointPath, Mode, Motion, MotionState, Robot, RobotState, StopResult
@@ -214,15 +214,14 @@ class ControlledRobot(Robot):
         return self._map.velocity_from_controller(change)
 
     def _standing_after(self, link: ArmLink, sent: float, deadline: float) -> StopResult:
-        """Wait for a report after ``sent`` that says that the arm stands; DeviceTimeout."""
-        standing, after = Standing(), sent
-        while True:
-            report = link.report_after(after, deadline)
-            if report.in_motion is False or standing.look(report) >= STANDS_FOR:
-                return StopResult(confirmed=True)
-            after = report.time
-            if after >= deadline:
+        """Wait for a report after ``sent`` that says that the arm stands; DeviceTimeout where none comes at all."""
+        standing, report = Standing(), link.report_after(sent, deadline)
+        while report.in_motion is not False and standing.look(report) < STANDS_FOR:
+            try:
+                report = link.report_after(report.time, deadline)
+            except DeviceTimeout:
                 return StopResult(confirmed=False, detail="the controller still says that the arm moves")
+        return StopResult(confirmed=True)
 
     def _refuse_unless_ready(self, report: ArmReport) -> None:
         if report.mode is not Mode.READY or report.faults:

@@ -117,7 +117,7 @@ class CellGuard:
             own = geometry.active.own_clearance(q)
             return float(np.minimum(own, geometry.between(q, q_other, placement))[0])
 
-        return self._bounds(self._active, geometry.active, start, path, clearance, least)
+        return self._bounds(self._active, other, geometry.active, start, path, clearance, least)
 
     def _admit_passive(self, start: RobotState, path: JointPath) -> Bounds | None:
         geometry, placement = self._geometry, self._placement
@@ -133,11 +133,12 @@ class CellGuard:
             own = geometry.passive.own_clearance(q)
             return float(np.minimum(own, geometry.between(q_other, q, placement))[0])
 
-        return self._bounds(self._passive, geometry.passive, start, path, clearance, least)
+        return self._bounds(self._passive, other, geometry.passive, start, path, clearance, least)
 
     def _bounds(
         self,
         robot: GuardedRobot,
+        standing: Joints,
         body: ArmBody,
         start: RobotState,
         path: JointPath,
@@ -150,6 +151,7 @@ class CellGuard:
             return None
         return Bounds(
             other=self._passive if robot is self._active else self._active,
+            standing=standing,
             waypoints=np.array([start.positions, *path.waypoints]),
             corner=self._corridor / _LEVER,
             clearance=clearance,

@@ -10,7 +10,7 @@ import numpy as np
 
 from dualcal_hal.clock import Clock
 from dualcal_hal.errors import DeviceError, DeviceTimeout, MotionFailed
-from dualcal_hal.robot import Mode, Robot, RobotState
+from dualcal_hal.robot import Joints, Mode, Robot, RobotState
 from dualcal_hal.transforms import Array
 
 FEEDBACK_PERIODS, LEAST_FEEDBACK_AGE = 3.0, 0.1
@@ -32,12 +32,13 @@ _PERIOD_SHARE = 0.2  # of a new interval in the mean of them
 class Bounds:
     """What holds for one motion.
 
-    other: the arm beside the one that moves. waypoints: (w, n) rad, where it stands first. corner: rad more that it may
+    other: the arm beside the one that moves; standing: where that stands, rad. waypoints: (w, n) rad, where it stands first. corner: rad more that it may
     be off the path. clearance: of the moving arm's joint angles (n,) in rad and the other's, m; least: m that it may
     not fall below. speed: of its joint angles and velocities, m/s; fastest: m/s that it may not exceed, None for any.
     """
 
     other: Robot
+    standing: Joints
     waypoints: Array
     corner: float
     clearance: Callable[[Array, Array], float]
@@ -99,7 +100,7 @@ class Watch:
         if state is None:
             return None
         q, velocity = np.array(state.positions), np.array(state.velocities)
-        return self._off_path(q) or self._too_fast(q, velocity) or self._too_close(q, other)
+        return self._off_path(q) or self._too_fast(q, velocity) or self._too_close(q, other) or self._other_moved(other)
 
     def _off_path(self, q: Array) -> DeviceError | None:
         off = off_path(self._bounds.waypoints, q)
@@ -125,6 +126,18 @@ class Watch:
         if clearance >= self._bounds.least:
             return None
         return self._failed(f"clearance may be down to {clearance * 1e3:.1f} mm, less than anywhere on its path")
+
+    def _other_moved(self, other: RobotState | None) -> DeviceError | None:
+        if other is None:
+            return None
+        moved = np.abs(np.subtract(other.positions, self._bounds.standing))
+        joint = int(np.argmax(moved))
+        if moved[joint] <= OFF_THE_PATH:
+            return None
+        why = f"it was to stand while {self._moving.name} moves, and joint {joint + 1} has turned by "
+        return MotionFailed(
+            self._other.name, "watch", f"{why}{np.rad2deg(moved[joint]):.2f} deg", "both arms are stopped; find out why"
+        )
 
     def _failed(self, why: str) -> MotionFailed:
         return MotionFailed(self._moving.name, "move", why, "both arms are stopped; find out why first")

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from backends.controller.joint_map import JointMap
 from backends.controller.link import ArmLink
 from backends.controller.options import ControllerOptions, Link
-from backends.controller.robot import ControlledRobot
+from backends.controller.robot import ControlledRobot, OwnSpeed
 from dualcal_hal.backend import Backend
 from dualcal_hal.camera import Camera
 from dualcal_hal.clock import RealClock
@@ -40,8 +40,9 @@ class ControllerBackend(Backend):
         self._link = options.link
         self._clock = RealClock()
         self._maps = _joint_maps(name, cell, self._link)
+        speed = _own_speed(self._link)
         self._robots = {
-            arm: ControlledRobot(arm, JointLimits.of(cell.cell.robots[arm]), joint_map, self._clock)
+            arm: ControlledRobot(arm, JointLimits.of(cell.cell.robots[arm]), joint_map, self._clock, speed)
             for arm, joint_map in self._maps.items()
         }
         self._open: ExitStack | None = None
@@ -94,6 +95,13 @@ class ControllerBackend(Backend):
         """The most that each arm's controller's joints can, rad/s."""
         limits = {arm: JointLimits.of(self.cell.cell.robots[arm]).speed for arm in self._maps}
         return {arm: tuple(self._maps[arm].bound_to_controller(speed).tolist()) for arm, speed in limits.items()}
+
+
+def _own_speed(link: Link) -> OwnSpeed | None:
+    if link.tcp is None or not link.tcp.ignores_velocity:
+        return None
+    confirmed = link.tcp.controller_speed_confirmed
+    return OwnSpeed(None if confirmed is None else confirmed.mm_s / 1000)
 
 
 def _joint_maps(name: str, cell: CellFile, link: Link) -> dict[str, JointMap]:

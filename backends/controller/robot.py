@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,11 +28,22 @@ STATE_TIMEOUT = 1.0
 """Seconds within which a report has to come before a motion."""
 
 
+@dataclass(frozen=True)
+class OwnSpeed:
+    """Of a controller that ignores the speed it is sent; confirmed: m/s that it was confirmed to be set to, or None."""
+
+    confirmed: float | None
+
+
 class ControlledRobot(Robot):
     """Its link is given by :meth:`attach` while the backend is open; without one every call raises NotOpen."""
 
-    def __init__(self, name: str, limits: JointLimits, joint_map: JointMap, clock: Clock) -> None:
+    def __init__(
+        self, name: str, limits: JointLimits, joint_map: JointMap, clock: Clock, speed: OwnSpeed | None = None
+    ) -> None:
+        """``speed``: the controller's own, where it does not keep a path's."""
         self.name = name
+        self._speed = speed
         self._limits = limits
         self._map = joint_map
         self._clock = clock
@@ -64,6 +76,14 @@ class ControlledRobot(Robot):
     @property
     def joints(self) -> int:
         return len(self._limits.lower)
+
+    @property
+    def keeps_speed(self) -> bool:
+        return self._speed is None
+
+    @property
+    def confirmed_speed(self) -> float | None:
+        return None if self._speed is None else self._speed.confirmed
 
     def read(self, timeout: float) -> RobotState:
         link, now = self._opened("read"), self._clock.now()

@@ -20,7 +20,8 @@ from dualcal_hal.transforms import Array
 
 LATENCY = 0.02  # s of simulated time from the start of the exposure to the frame
 
-_POSES = 9  # that the target is drawn at during an exposure
+POSES = 9
+"""Poses that the target is drawn at during an exposure that takes time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +67,14 @@ class SimulatedCamera(Camera):
             sequence = self.frames
         image = sight.renderer.expose([T_E_T, *self._later_poses(world, begin)], view)
         self._wait(world, begin + self._latency)
-        return Frame(_with_noise(image, noise, world.noise.image_grey), begin, sequence)
+        return Frame(with_noise(image, noise, world.noise.image_grey), begin, sequence)
 
     def _later_poses(self, world: World, begin: float) -> list[Array]:
         """The target in the camera (4, 4) at further times of an exposure, none if that takes no time."""
         if self._exposure == 0.0:
             return []
         poses = []
-        for when in np.linspace(begin, begin + self._exposure, _POSES)[1:].tolist():
+        for when in np.linspace(begin, begin + self._exposure, POSES)[1:].tolist():
             self._wait(world, when)
             poses.append(world.T_E_T(when))
         return poses
@@ -87,7 +88,7 @@ class SimulatedCamera(Camera):
             raise NotOpen(self.name, "grab", "it was closed meanwhile", "open its backend again")
 
 
-def _with_noise(image: Values, source: np.random.Generator, sigma: float) -> Image:
+def with_noise(image: Values, source: np.random.Generator, sigma: float) -> Image:
     """The grey values with noise, rounded to 8 bits; read-only."""
     noise = normal_image(source, image.shape)
     exposed = np.asarray(cv2.addWeighted(image, 1.0, noise, sigma, 0.0, dtype=cv2.CV_8U), dtype=np.uint8)

@@ -25,6 +25,7 @@ FAULTS = {
     "mode": "the key switch is turned to manual (TCP)",
     "drive-fault": "a drive fails",
     "lost-link": "the arm's connections break, and it cannot be reached for a while",
+    "following-error": "a drive's axis is blocked (CAN)",
     "emergency": "a drive sends an emergency frame (CAN)",
     "node-reboot": "a drive reboots (CAN)",
     "heartbeat-loss": "a drive's heartbeat ceases (CAN)",

@@ -141,6 +141,41 @@ def schema() -> None:
         typer.echo(json.dumps(cell_schema(), indent=2))
 
 
+@app.command()
+def emulate(
+    cell: Cell,
+    overrides: Set = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option("--fault", metavar="NAME[:ARM]@WHEN[~SECONDS]", help="Have something go wrong; may be repeated."),
+    ] = None,
+    free_ports: Annotated[
+        bool, typer.Option("--free-ports", help="Listen at ports that are free, not at those of the cell file.")
+    ] = False,
+    until_stdin_closes: Annotated[
+        bool, typer.Option("--until-stdin-closes", help="End when standard input closes, too.")
+    ] = False,
+) -> None:
+    """Put the simulated world of a cell behind the real wire protocols of its controllers and its camera.
+
+    Prints where it listens, as one line of JSON, once it does; on this machine only. Ends at SIGINT and SIGTERM.
+
+    \b
+    Faults: drop and delay (a reply), split and merge (messages), corrupt (bytes of a state), half-open
+    (connections), stale (feedback), estop, mode (to manual), drive-fault, lost-link; on CAN emergency,
+    node-reboot, heartbeat-loss, sdo-abort, missing-pdo, too. WHEN: seconds, as 12.5; or motion:3, which is
+    0.1 s into the third motion of ARM, or of any arm where none is named; or point:7, as its seventh
+    trajectory point comes. SECONDS: how long it lasts, where it does.
+
+    Exit code 0, 1 if it could not go on, 2 for a call or cell file that cannot be used.
+    """
+    with ended_in_order():
+        from tools.cli.emulate import EmulateOptions
+        from tools.cli.emulate import emulate as serve
+
+        serve(EmulateOptions(cell, tuple(overrides or ()), tuple(fault or ()), free_ports, until_stdin_closes))
+
+
 log_app = typer.Typer(help="Look at, check, repair and export the log of a session.", no_args_is_help=True)
 app.add_typer(log_app, name="log")
 

@@ -32,9 +32,10 @@ _PERIOD_SHARE = 0.2  # of a new interval in the mean of them
 class Bounds:
     """What holds for one motion.
 
-    other: the arm beside the one that moves; standing: where that stands, rad. waypoints: (w, n) rad, where it stands first. corner: rad more that it may
-    be off the path. clearance: of the moving arm's joint angles (n,) in rad and the other's, m; least: m that it may
-    not fall below. speed: of its joint angles and velocities, m/s; fastest: m/s that it may not exceed, None for any.
+    other: the arm beside the one that moves; standing: where that stands, rad. waypoints: (w, n) rad, where the moving
+    one stands first. corner: rad more that it may be off the path. clearance: of the moving arm's joint angles (n,) in
+    rad and the other's, m; least: m that it may not fall below. speed: of its joint angles and velocities, m/s;
+    fastest: m/s that it may not exceed, None for any.
     """
 
     other: Robot

@@ -12,6 +12,7 @@ ENTRY_POINT_GROUP = "dualcal.backends"
 
 _BUILT_IN = {
     "controller": "backends.controller:ControllerBackend",
+    "genicam": "backends.cameras.genicam_backend:GenicamBackend",
     "opencv": "backends.cameras.opencv_backend:OpencvBackend",
     "replay": "backends.replay:ReplayBackend",
     "simulator": "backends.simulator:SimulatorBackend",

@@ -13,19 +13,25 @@ from dualcal_hal.session.plain import Fields
 CONDUCT = "run.json"
 CONDUCT_FORMAT = "dualcal.run/1"
 
+CALIBRATION, INTRINSICS = PROCEDURES = ("calibration", "intrinsics")
+"""What runs are for."""
+
 
 @dataclass(frozen=True)
 class Conduct:
-    """pace: how fast the arms might be; emulated: whether the devices were an emulator started for the run."""
+    """pace: how fast the arms might be; emulated: whether the devices were an emulator started for the run; procedure:
+    its name on the command line."""
 
     pace: Pace = FULL_PACE
     emulated: bool = False
+    procedure: str = CALIBRATION
 
     def to_document(self) -> dict[str, Any]:
         """As in the file."""
         largest = self.pace.largest
         return {
             "format": CONDUCT_FORMAT,
+            "procedure": self.procedure,
             "emulated": self.emulated,
             "speed": {"share": self.pace.share, "largest_mm_s": None if largest is None else largest * 1e3},
         }
@@ -43,7 +49,8 @@ def read_conduct(session: Session) -> Conduct:
         largest = None if speed.is_null("largest_mm_s") else speed.finite("largest_mm_s") / 1e3
         if not 0 < share <= 1 or (largest is not None and largest <= 0):
             raise ValueError("speed: is none that arms could have")
-        return Conduct(Pace(share, largest), fields.flag("emulated"))
+        procedure = fields.choice("procedure", PROCEDURES) if "procedure" in fields else CALIBRATION
+        return Conduct(Pace(share, largest), fields.flag("emulated"), procedure)
     except ValueError as error:
         if isinstance(error, FormatError):
             raise

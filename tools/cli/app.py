@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +27,13 @@ Method = Annotated[str | None, typer.Option(help="Estimator; overrides procedure
 Json = Annotated[bool, typer.Option("--json", help="Print result.json alone on standard output.")]
 
 
+class Procedure(StrEnum):
+    """As ``dualcal_hal.session.conduct`` has them."""
+
+    CALIBRATION = "calibration"
+    INTRINSICS = "intrinsics"
+
+
 @app.command()
 def run(
     cell: Annotated[
@@ -36,6 +44,9 @@ def run(
         Path | None, typer.Option("--resume", metavar="SESSION", help="Go on with a session that was interrupted.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Session folder. Default: sessions/<time>-<cell>.")] = None,
+    procedure: Annotated[
+        Procedure | None, typer.Option(help="What to run; intrinsics are the camera's matrix and distortion.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Sets procedure.seed and simulation.seed.")] = None,
     method: Method = None,
     overrides: Set = None,
@@ -85,6 +96,7 @@ def run(
                 emulate=emulate,
                 enable=enable,
                 faults=tuple(fault or ()),
+                procedure=None if procedure is None else procedure.value,
             )
         )
     raise typer.Exit(code)
@@ -174,6 +186,32 @@ def emulate(
         from tools.cli.emulate import emulate as serve
 
         serve(EmulateOptions(cell, tuple(overrides or ()), tuple(fault or ()), free_ports, until_stdin_closes))
+
+
+intrinsics_app = typer.Typer(help="The camera's matrix and distortion.", no_args_is_help=True)
+app.add_typer(intrinsics_app, name="intrinsics")
+
+
+@intrinsics_app.callback()
+def _intrinsics() -> None:
+    """A group, though it has one command: dualcal run --procedure intrinsics finds them."""
+
+
+@intrinsics_app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="OpenCV's YAML or JSON, or ROS's camera_info YAML.")],
+    cell: Annotated[Path, typer.Option(help="The cell file whose camera it is.")],
+    out: Annotated[Path | None, typer.Option(help="Where to write the lines for the cell file.")] = None,
+    overrides: Set = None,
+) -> None:
+    """Turn another program's camera file into the lines for a cell file.
+
+    Exit code 0, 2 for a file that cannot be used, or is of images of another size than the cell's.
+    """
+    with ended_in_order():
+        from tools.cli.intrinsics import import_intrinsics
+
+        import_intrinsics(file, cell, out, tuple(overrides or ()))
 
 
 log_app = typer.Typer(help="Look at, check, repair and export the log of a session.", no_args_is_help=True)

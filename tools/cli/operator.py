@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 
 from procedures.events import LooksProposed, PlanReady
+from procedures.intrinsics.procedure import ViewsProposed
 from procedures.report import plan_table, posture_table, way_table
 
 _POLL = 0.1  # s between two looks whether the run was aborted
@@ -64,6 +65,9 @@ class Operator:
                 self._console.print("The plan:")
                 self._console.print(plan_table(plan))
                 return "Both arms will move by this plan. Go on?"
+            case ViewsProposed():
+                self._console.print(str(proposal), highlight=False)
+                return "The passive arm will show the target so. Go on?"
         raise TypeError(f"{proposal!r} is nothing to be shown")
 
 

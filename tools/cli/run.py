@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Protocol
 
 import typer
 from rich.console import Console
@@ -22,7 +23,7 @@ from dualcal_hal.config import CellConfig
 from dualcal_hal.errors import FormatError, NotConfirmed, Problem, UsageError
 from dualcal_hal.pace import REDUCED_SPEED, Pace
 from dualcal_hal.session.captures import CaptureRecord, Captures, CellShape, write_captures
-from dualcal_hal.session.conduct import Conduct, keep_conduct
+from dualcal_hal.session.conduct import CALIBRATION, INTRINSICS, Conduct, keep_conduct, read_conduct
 from dualcal_hal.session.distances import DISTANCES, Distances, read_distances
 from dualcal_hal.session.folder import CELL_FILE, Session
 from dualcal_hal.session.lock import SessionLock
@@ -39,6 +40,7 @@ from procedures.planning.model import CellModel
 from procedures.planning.plan import PLAN_FORMAT, Plan
 from procedures.rehearsal import rehearse, require_reach
 from procedures.report import draw_plan, draw_summary
+from procedures.steps import Procedure
 from tools.cli.emulator import emulator
 from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.operator import Operator
@@ -48,6 +50,14 @@ from tools.cli.terminal import Screen, plain
 from tools.cli.truth import simulated_truth
 
 PLAN_FILE = "plan.json"
+
+
+class Stepping(Protocol):
+    """What the engine is given the steps of."""
+
+    def steps(self) -> Procedure[None]:
+        """All of the run."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -68,31 +78,36 @@ class RunOptions:
     emulate: bool = False
     enable: bool = False
     faults: tuple[str, ...] = ()
+    procedure: str | None = None
 
 
 def run_cell(options: RunOptions) -> int:
     """Prepare, run, analyse; returns the exit code."""
+    if _procedure(options) == INTRINSICS:
+        from tools.cli.intrinsics import run_intrinsics
+
+        return run_intrinsics(options)
     # With --json standard output is for the result alone.
     console = Screen(stderr=options.json)
     if options.resume is not None:
         return _resume(console, options, options.resume)
     if options.cell is None:
         raise UsageError("name a cell file, or with --resume a session to go on with")
-    file = _load(options, options.cell)
+    file = load_asked(options, options.cell)
     model = CellModel(file.cell)
     calibration = Calibration(file.cell, model)
-    cell = _cell(options, file, options.cell)
+    cell = cell_at_pace(options, file, options.cell)
     _warn_of_alignment_error(console, file, model)
     if options.dry_run:
         _rehearse(console, file, model, options)
         return 0
     require_reach(file.cell, model)
-    commissioning = _commissioned(cell, options, file, options.cell)
+    commissioning = commissioned(cell, options, file, options.cell)
     started = utc_now()
     text, copies = standing_alone(file)
-    folder = options.out or _unused_folder(started, file.cell.name)
+    folder = options.out or unused_folder(started, file.cell.name)
     session = Session.create(folder, text, started.isoformat(timespec="seconds"), copies)
-    with _kept(session), SessionLock(session.folder):
+    with kept(session), SessionLock(session.folder):
         keep_conduct(session, Conduct(cell.pace, options.emulate))
         if commissioning is not None:
             commissioning.copy_beside(session.cell_path)
@@ -104,36 +119,46 @@ def run_cell(options: RunOptions) -> int:
         return _report(console, options, file, session, result, commissioning)
 
 
+def _procedure(options: RunOptions) -> str:
+    """The one that is asked for, which a session has decided on already."""
+    if options.resume is None:
+        return options.procedure or CALIBRATION
+    begun = read_conduct(Session(options.resume)).procedure
+    if options.procedure not in (None, begun):
+        raise UsageError(f"{options.resume}: the session is one of --procedure {begun}, not {options.procedure}")
+    return begun
+
+
 def _resume(console: Console, options: RunOptions, folder: Path) -> int:
     """Go on with a session, or report it again."""
     if options.out is not None or options.dry_run:
         raise UsageError("--resume goes on in the session's own folder: it takes neither --out nor --dry-run")
-    file = _file_of(options, folder)
+    file = file_of(options, folder)
     if (session := Session(folder)).result_path.exists() and _is_finished(file, session):
         return _report(console, options, file, session, read_result(session.result_path))
     with SessionLock(folder) as lock:
         if lock.left_by is not None:
-            _say(console, f"{folder}: taken over from {lock.left_by}, which has ended without giving it back")
+            say_line(console, f"{folder}: taken over from {lock.left_by}, which has ended without giving it back")
         session = Session(folder)  # as it is now that nobody else writes it
         session.go_on(utc_now().isoformat(timespec="seconds"))
-        with _kept(session):
+        with kept(session):
             steps = session.journal.results()
-            _say(console, f"going on with {folder}: {len(steps)} steps are finished")
+            say_line(console, f"going on with {folder}: {len(steps)} steps are finished")
             if is_complete(captures := _captures(file, session), file.cell.procedure):
-                _say(console, "all is captured already: only the analysis is left, and no arm is moved")
+                say_line(console, "all is captured already: only the analysis is left, and no arm is moved")
                 write_captures(session.captures_path, captures)
-                result = conclude(file, session, captures, lambda line: _say(console, line))
+                result = conclude(file, session, captures, lambda line: say_line(console, line))
                 commissioning = None
             else:
                 model = CellModel(file.cell)
-                calibration, cell = Calibration(file.cell, model), _cell(options, file, session.cell_path)
-                commissioning = _commissioned(cell, options, file, session.cell_path)
+                calibration, cell = Calibration(file.cell, model), cell_at_pace(options, file, session.cell_path)
+                commissioning = commissioned(cell, options, file, session.cell_path)
                 keep_conduct(session, Conduct(cell.pace, options.emulate))
                 result = _finish(console, options, file, cell, calibration, session)
             return _report(console, options, file, session, result, commissioning)
 
 
-def _file_of(options: RunOptions, folder: Path) -> CellFile:
+def file_of(options: RunOptions, folder: Path) -> CellFile:
     """The cell file of a session; UsageError with a diff if the command line asks for another."""
     session_file = folder / CELL_FILE
     if not folder.is_dir():
@@ -141,7 +166,7 @@ def _file_of(options: RunOptions, folder: Path) -> CellFile:
     if not session_file.exists():
         raise UsageError(f"{folder}: there is no {CELL_FILE} in it, so it is no session that could go on")
     file = load_cell(session_file)
-    given, _ = standing_alone(_load(options, options.cell or session_file))
+    given, _ = standing_alone(load_asked(options, options.cell or session_file))
     if diff := differences(file.text, given):
         raise UsageError(f"{folder}: the session was begun with another cell file than is asked for now:\n{diff}")
     return file
@@ -157,16 +182,16 @@ def _finish(
 ) -> Result:
     """Run from where the session's journal ends, and analyse."""
     go_on_from_journal(cell, session)
-    with _recording(options, session, file, cell) as recording, _devices(options, cell, session):
+    with recording_of(options, session, file, cell) as recording, devices(options, cell, session):
         cell.record(recording)
         captures = _run(console, options, file, cell, calibration, session)
-        result = conclude(file, session, captures, lambda line: _say(console, line))
+        result = conclude(file, session, captures, lambda line: say_line(console, line))
         recording.document(session.result_path.name, result.to_document())
     return result
 
 
 @contextmanager
-def _devices(options: RunOptions, cell: Cell, session: Session) -> Iterator[None]:
+def devices(options: RunOptions, cell: Cell, session: Session) -> Iterator[None]:
     """The cell's devices are those of an emulator beside it while this lasts, if that is asked for."""
     if not options.emulate:
         yield
@@ -201,28 +226,31 @@ def _report(
     if commissioning is not None and result.verdict == "ok":
         commissioning.record_verified(f"verdict {result.verdict} of session {session.folder.name}")
     if (distances := read_distances(session)) is not None:
-        _say(console, f"least distance between the arms {distances.least()}")
-    _say(console, f"session: {session.folder}")
+        say_line(console, f"least distance between the arms {distances.least()}")
+    say_line(console, f"session: {session.folder}")
     return 0 if result.verdict == "ok" else FAULT
 
 
-def _say(console: Console, line: str) -> None:
+def say_line(console: Console, line: str) -> None:
+    """A line for the operator, as long as it is."""
     console.print(line, soft_wrap=True, highlight=False)
 
 
 @contextmanager
-def _kept(session: Session) -> Iterator[None]:
+def kept(session: Session, *, can_be_estimated: bool = True) -> Iterator[None]:
     """Whatever ends the run, say how to go on."""
     try:
         yield
     except BaseException as error:
         folder = shlex.quote(str(session.folder))
         error.add_note(f"the session is kept; to go on with it: dualcal run --resume {folder}")
-        error.add_note(f"what it has so far: dualcal estimate {folder}")
+        if can_be_estimated:
+            error.add_note(f"what it has so far: dualcal estimate {folder}")
         raise
 
 
-def _recording(options: RunOptions, session: Session, file: CellFile, cell: Cell) -> Recording:
+def recording_of(options: RunOptions, session: Session, file: CellFile, cell: Cell) -> Recording:
+    """Where all that passes is told to: the session's next log, or nowhere."""
     return LogRecording(next_segment(session.folder), file, cell.clock) if options.log else Recording()
 
 
@@ -241,7 +269,7 @@ def _run(
                     watcher,
                     lambda engine: signals.pass_on_to(engine.abort),
                     operator.confirms,
-                    prepare=lambda opened: _prepare(console, options, opened, operator),
+                    prepare=lambda opened: prepare_arms(console, options, opened, operator),
                 )
         except BaseException as error:
             try:
@@ -268,7 +296,8 @@ def _rehearse(console: Console, file: CellFile, model: CellModel, options: RunOp
     console.print(f"plan and picture: {session.folder}", soft_wrap=True, highlight=False)
 
 
-def _load(options: RunOptions, path: Path) -> CellFile:
+def load_asked(options: RunOptions, path: Path) -> CellFile:
+    """The cell file with what the command line sets in it."""
     overrides = list(options.overrides)
     if options.method is not None:
         overrides.append(f"procedure.method={options.method}")
@@ -279,7 +308,8 @@ def _load(options: RunOptions, path: Path) -> CellFile:
     return load_cell(path, overrides)
 
 
-def _unused_folder(started: datetime, name: str) -> Path:
+def unused_folder(started: datetime, name: str) -> Path:
+    """For a session that is begun now."""
     folder = Path("sessions") / f"{started:%Y%m%d-%H%M%S}-{name}"
     numbered = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
     return folder if not folder.exists() else next(other for other in numbered if not other.exists())
@@ -298,7 +328,7 @@ def _captures(file: CellFile, session: Session) -> Captures:
 
 def execute(
     cell: Cell,
-    calibration: Calibration,
+    calibration: Stepping,
     session: Session,
     watcher: Observer,
     begun: Callable[[Engine], None] = lambda engine: None,
@@ -394,7 +424,7 @@ def analyse_session(file: CellFile, session: Session, captures: Captures, truth:
     return result
 
 
-def _cell(options: RunOptions, file: CellFile, path: Path) -> Cell:
+def cell_at_pace(options: RunOptions, file: CellFile, path: Path) -> Cell:
     """The cell of ``path``, its devices not open yet, at the pace that its commissioning and ``--speed`` allow."""
     cell = Cell(file)
     if options.emulate and cell.time != "real":
@@ -405,7 +435,7 @@ def _cell(options: RunOptions, file: CellFile, path: Path) -> Cell:
     return Cell(file, Pace(options.speed, None if free else REDUCED_SPEED))
 
 
-def _commissioned(cell: Cell, options: RunOptions, file: CellFile, path: Path) -> Commissioning | None:
+def commissioned(cell: Cell, options: RunOptions, file: CellFile, path: Path) -> Commissioning | None:
     """The record of a cell that is not simulated; UsageError if its arms must not be moved yet."""
     if cell.simulated or options.emulate:
         return None
@@ -415,14 +445,14 @@ def _commissioned(cell: Cell, options: RunOptions, file: CellFile, path: Path) -
     return commissioning
 
 
-def _prepare(console: Console, options: RunOptions, cell: Cell, operator: Operator) -> None:
+def prepare_arms(console: Console, options: RunOptions, cell: Cell, operator: Operator) -> None:
     """What the operator wants done before the procedure begins, once the devices are open."""
     if not (options.enable or options.emulate):
         return
     if not operator.agrees("Switch the drives of both arms on?"):
         raise NotConfirmed("not confirmed by the operator: the drives were left as they are")
     for name in cell.enable_arms():
-        _say(console, f"{name}: its drives are on")
+        say_line(console, f"{name}: its drives are on")
 
 
 def _warn_of_alignment_error(console: Console, file: CellFile, model: CellModel) -> None:

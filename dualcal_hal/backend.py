@@ -60,6 +60,10 @@ class Backend(ABC):
     def open(self, timeout: float) -> None:
         """Make its devices usable, or raise and leave nothing open. Opening an open one is an error."""
 
+    def open_alone(self, device: str, timeout: float) -> None:
+        """As :meth:`open`, for one arm or camera alone where the others can be left out; else for all."""
+        self.open(timeout)
+
     @abstractmethod
     def close(self) -> None:
         """Stop and release everything; any number of times, also after a failed open."""

@@ -56,11 +56,18 @@ class ControllerBackend(Backend):
         self.simulated = True
 
     def open(self, timeout: float) -> None:
+        self._open_arms(sorted(self._robots), timeout)
+
+    def open_alone(self, device: str, timeout: float) -> None:
+        self._open_arms([self.robot(device).name], timeout)
+
+    def _open_arms(self, arms: list[str], timeout: float) -> None:
         if self._open is not None:
             raise UsageError(f"{self.name}: open: it is open already; close it first")
         deadline = self._clock.now() + timeout
+        links = self._links()
         with ExitStack() as if_it_fails:
-            for arm, link in sorted(self._links().items()):
+            for arm, link in ((arm, links[arm]) for arm in arms):
                 if_it_fails.callback(link.close)
                 link.open(deadline)
                 if_it_fails.callback(self._robots[arm].detach)

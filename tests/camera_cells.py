@@ -5,15 +5,17 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from backends.cameras.publisher import FramePublisher
 from dualcal_hal.camera import Image
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.clock import RealClock
 from tests.cells import TINY
+
+if TYPE_CHECKING:
+    from backends.cameras.publisher import FramePublisher
 
 SIZE = (512, 384)
 """Of the cell's intrinsics: width, height."""

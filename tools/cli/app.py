@@ -142,6 +142,39 @@ def replay(
     raise typer.Exit(code)
 
 
+@app.command("serve-camera")
+def serve_camera(
+    cell: Cell,
+    bind: Annotated[
+        str, typer.Option(metavar="ENDPOINT", help="Where to serve; port 0 for any that is free.")
+    ] = "tcp://127.0.0.1:0",
+    backend: Annotated[
+        str | None, typer.Option(help="The entry under backends whose camera it is. Default: camera.backend.")
+    ] = None,
+    name: Annotated[str, typer.Option(help="What listeners know the camera by.")] = "camera",
+    rate: Annotated[float, typer.Option(min=0.1, max=1000.0, help="Frames a second, at most.")] = 25.0,
+    key: Annotated[Path | None, typer.Option(metavar="FILE", help="This PC's secret key (*.key_secret).")] = None,
+    allow: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="The public keys (*.key) of those who may listen.")
+    ] = None,
+    overrides: Set = None,
+) -> None:
+    """Serve a camera of a cell file from the PC that it hangs on, to cells that reach it by a zmq backend.
+
+    Beyond this machine it is served only with --key and --allow. It goes on until a signal ends it. Exit code 130
+    then, 1 when the camera is lost, 2 for a call or cell file that cannot be used.
+    """
+    with ended_in_order():
+        try:
+            from tools.cli.serve_camera import ServeOptions, serve_camera
+        except ImportError as error:
+            from dualcal_hal.errors import UsageError
+
+            raise UsageError(f"what serves cameras is not installed ({error}): pip install 'dualcal[zmq]'") from error
+
+        serve_camera(ServeOptions(cell, tuple(overrides or ()), bind, backend, name, rate, key, allow))
+
+
 @app.command()
 def schema() -> None:
     """Print the JSON Schema of a cell file."""

@@ -82,7 +82,7 @@ def _conventions(poses: Poses) -> Iterator[Cause]:
     """Orientations typed in another form than was said."""
     R = poses.flange[:, :3, :3]
     rotation = Rotation.from_matrix(R)
-    angles, quaternion = rotation.as_euler("ZYX"), rotation.as_quat()
+    angles, quaternion = _angles(R), rotation.as_quat()
     ours = poses.chain.forward(poses.joints)
     for what, meant in (
         ("the three angles in the opposite order, as W P R for A B C", Rotation.from_euler("ZYX", angles[:, ::-1])),
@@ -101,6 +101,12 @@ def _conventions(poses: Poses) -> Iterator[Cause]:
             6.0,
             Deviation.between(ours, transform(meant.as_matrix(), poses.flange[:, :3, 3])),
         )
+
+
+def _angles(R: Array) -> Array:
+    """Turns (k, 3) in rad about z, the new y and the new x; where y is 90 deg, some of those that there are."""
+    y = -np.arcsin(np.clip(R[:, 2, 0], -1.0, 1.0))
+    return np.stack([np.arctan2(R[:, 1, 0], R[:, 0, 0]), y, np.arctan2(R[:, 2, 1], R[:, 2, 2])], axis=1)
 
 
 def _kinematics(poses: Poses, index: int) -> Iterator[Cause]:

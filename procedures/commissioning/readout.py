@@ -37,7 +37,7 @@ def _from_wxyz(numbers: Array) -> Array:
 Form = tuple[tuple[str, ...], Callable[[Array], Array]]
 
 FORMS: dict[str, Form] = {
-    "rotation-vector": (("rx", "ry", "rz"), _from_vector),
+    "rotation-vector": (("vx", "vy", "vz"), _from_vector),
     "abb": (("q1", "q2", "q3", "q4"), _from_wxyz),
     "fanuc": (("W", "P", "R"), _from_fixed_xyz),
     "kuka": (("A", "B", "C"), _from_moving_zyx),

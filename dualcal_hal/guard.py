@@ -81,7 +81,7 @@ class CellGuard:
         self._geometry = geometry
         self._pace, self._corridor, self._watched = pace, corridor, watched
         self._placement = placement
-        self._clearance = clearance * PLANNERS_SHARE
+        self._clearance = clearance * PLANNERS_SHARE + corridor
         one_at_a_time = threading.Lock()
         active.admit(self._admit_active, one_at_a_time)
         passive.admit(self._admit_passive, one_at_a_time)

@@ -52,14 +52,16 @@ class Standing:
 class Following:
     """``begun``: whether its course has been accepted. It ends its motion by settling alone; the rest is the arm's."""
 
-    def __init__(self, motion: Motion, clock: Clock) -> None:
+    def __init__(self, motion: Motion, clock: Clock, begins_within: float = 0.0) -> None:
+        """``begins_within``: as the link's."""
         self.motion = motion
+        self._begins_within = begins_within
         self._clock = clock
         self._course: Course | None = None
         self._transfer = Transfer()
         self._begin = clock.now()
         self._standing = Standing()
-        self._excursion = False
+        self._near = self._far = self._excursion = False
         self._stopping = False
 
     @property
@@ -74,10 +76,10 @@ class Following:
     def begin(self, course: Course, transfer: Transfer) -> None:
         """The controller has begun to take ``course``."""
         self._transfer, self._begin = transfer, self._clock.now()
-        # A way that leads back looks done before it has begun.
-        far = np.max(np.abs(np.subtract(course.waypoints, course.waypoints[-1])))
-        back = np.max(np.abs(np.subtract(course.start, course.waypoints[-1]))) <= ARRIVED
-        self._excursion = not (back and far > ARRIVED)
+        goal = course.waypoints[-1]
+        # A way that leads back to where it begins, or hardly away from there, looks done before it has begun.
+        self._near = bool(np.max(np.abs(np.subtract(course.start, goal))) <= ARRIVED)
+        self._far = bool(np.max(np.abs(np.subtract(course.waypoints, goal))) > ARRIVED)
         self._course = course
 
     def stopping(self) -> float:
@@ -96,11 +98,17 @@ class Following:
         stands = self._standing.look(report)
         if not self._transfer.complete:
             return None
-        if arrived and stands >= (STANDS_FOR if self._excursion else NEVER_LEFT):
+        if arrived and stands >= self._has_to_stand():
             self.motion.settle(state)
         elif not arrived and stands >= NEVER_ARRIVED and self._clock.now() >= self._begin + course.duration:
             return self._missed(away)
         return None
+
+    def _has_to_stand(self) -> float:
+        """Seconds for which it has to stand at its goal before it has arrived."""
+        if self._excursion or not self._near:
+            return STANDS_FOR
+        return max(STANDS_FOR, self._begins_within, NEVER_LEFT if self._far else 0.0)
 
     def fail(self, error: DeviceError) -> None:
         """End the motion by an error."""

@@ -82,6 +82,10 @@ class ArmLink(ABC):
     drives or acknowledges a fault by itself.
     """
 
+    begins_within: float = 0.0
+    """Seconds within which the controller begins to move once it has taken a course: before, an arm that stands near
+    its goal may not have begun."""
+
     def __init__(self, arm: str, joints: int) -> None:
         self.arm = arm
         self.joints = joints

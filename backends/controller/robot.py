@@ -106,7 +106,7 @@ class ControlledRobot(Robot):
         with self._lock:
             self._refuse_if_moving("move")
             motion = Motion(self.name, self._clock)
-            following = Following(motion, self._clock)
+            following = Following(motion, self._clock, link.begins_within)
             self._following = following
         try:
             now = self._clock.now()

@@ -55,6 +55,11 @@ class CellConfig(Section):
         return max((getattr(self.backends[name].checked, "corridor", 0.0) for name in used), default=0.0)
 
     @property
+    def clearance(self) -> float:
+        """Smallest distance (m) that planned paths keep: what the procedure wants, and the corridor."""
+        return self.procedure.clearance + self.corridor
+
+    @property
     def active_name(self) -> str:
         return self._name_by_role("active")
 

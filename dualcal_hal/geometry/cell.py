@@ -33,7 +33,7 @@ class CellGeometry:
         The camera's housing stands where ``T_H_E`` (4, 4) says, or the nominal one, and is thicker by ``camera_error``
         (m) all around.
         """
-        active, passive, clearance = cell.active, cell.passive, cell.procedure.clearance
+        active, passive, clearance = cell.active, cell.passive, cell.clearance
         T_H_E = cell.nominal.T_H_E if T_H_E is None else T_H_E
         housing = camera_capsule(active.chain.joints, T_H_E, cell.camera.body_radius, cell.camera.body_length)
         housing = replace(housing, radius=housing.radius + camera_error)

@@ -134,7 +134,7 @@ class CellModel:
         self.intrinsics: Intrinsics = cell.camera.intrinsics
         self.distance: tuple[float, float] = cell.procedure.distance
         self.tilt_max: float = cell.procedure.tilt_max
-        self.margin: float = cell.procedure.clearance + cell.corridor
+        self.margin: float = cell.clearance
         given = cell.procedure.stand_off
         self.stand_off = None if given is None else Posture.of(given.active, given.passive)
         self.nominal = Belief.nominal(cell.nominal)

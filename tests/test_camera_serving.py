@@ -15,6 +15,7 @@ import pytest
 pytest.importorskip("zmq", reason="the zmq camera is an extra: pip install 'dualcal[zmq]'")
 
 from backends.cameras.zmq_backend import ZmqBackend
+from dualcal_hal.errors import LinkLost
 from tests.camera_cells import CLOCK, camera_cell, picture
 from tests.cells import TINY
 from tests.command_line import dualcal
@@ -111,3 +112,16 @@ def test_what_serving_needs_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> N
     result = dualcal("serve-camera", TINY)
     assert result.exit_code == 2
     assert "pip install 'dualcal[zmq]'" in result.stderr
+
+
+@pytest.mark.slow
+def test_a_sender_that_falls_silent_without_an_end_is_a_lost_link(serve: Serve) -> None:
+    process, endpoint = serve()
+    backend = ZmqBackend("lens", camera_cell(f"{{type: zmq, endpoint: '{endpoint}'}}"))
+    backend.open(AMPLE)
+    try:
+        process.send_signal(signal.SIGSTOP)
+        with pytest.raises(LinkLost, match="connection was lost"):
+            backend.camera("camera").grab(CLOCK.now() + 1.0, AMPLE)
+    finally:
+        backend.close()

@@ -91,4 +91,5 @@ class SenderClock:
     @property
     def behind(self) -> tuple[float, float]:
         """Between which two numbers of seconds the sender's clock is behind the own one; infinite where not known."""
-        return max((m.sent - m.heard for m in self._marks), default=-math.inf), self._least_delay
+        marks = tuple(self._marks)  # asked for by another thread than the one that hears of marks
+        return max((m.sent - m.heard for m in marks), default=-math.inf), self._least_delay

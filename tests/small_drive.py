@@ -69,7 +69,7 @@ class SmallDrive:
 
     def statusword(self) -> int:
         arrived = self.set_point is None or self.position == self.set_point
-        return self.state | (0x400 if arrived else 0) | (0x1000 if self.taken else 0)
+        return self.state | 0x10 | (0x400 if arrived else 0) | (0x1000 if self.taken else 0)
 
     def control(self, word: int) -> None:
         before = self.controlwords[-1] if self.controlwords else 0

@@ -6,6 +6,7 @@ from collections import deque
 
 from backends.controller.can.drive import Goal
 from backends.controller.can.objects import (
+    VOLTAGE,
     Control,
     Emergency,
     Feedback,
@@ -51,6 +52,12 @@ class Axis:
     @property
     def state(self) -> State:
         return state_of(self.statusword)
+
+    @property
+    def condition(self) -> str:
+        """Its state in words, and why it may be in it."""
+        off = self.state is State.SWITCH_ON_DISABLED and not self.statusword & VOLTAGE
+        return f"{self.state}, without voltage for the motor (emergency stop?)" if off else str(self.state)
 
     @property
     def position(self) -> int:

@@ -41,7 +41,7 @@ LOST = 1.0
 _LATE_FEEDBACK = 0.1  # s, or three periods if that is longer
 _LATE_HEARTBEAT = 3.5 * HEARTBEAT
 _VELOCITY_OVER = 5  # periods
-_STANDING = 2  # counts within which a joint stands
+_STANDING = 2, 5e-5  # counts and rad within which a joint stands: what an encoder shows of itself
 
 Send = Callable[[Sequence[tuple[int, bytes]]], None]
 
@@ -327,7 +327,7 @@ class Cycle:
                 self._fail_drive(axis, f"is in {axis.state}{hint}; it told no code")
         elif self._enabled and led and axis.state is not State.OPERATION_ENABLED:
             axis.goal = Goal.OFF  # it is enabled again by the operator alone
-            self._fail_drive(axis, f"has left operation enabled by itself, is {axis.state} now")
+            self._fail_drive(axis, f"has left operation enabled by itself, is {axis.condition} now")
 
     def _judge_silence(self, watches: list[_Watch], what: str) -> None:
         if watches:
@@ -375,9 +375,10 @@ class Cycle:
             return  # a velocity needs a past
         (begin, first), span = history[0], sync - history[0][0]
         velocities = []
+        steps, angle = _STANDING
         for number, axis in enumerate(axes):
             past = [entry[number] for _, entry in history]
-            stands = span <= 0.0 or max(past) - min(past) <= _STANDING
+            stands = span <= 0.0 or max(past) - min(past) <= max(steps, angle * axis.scale.counts_per_rad)
             rate = 0.0 if stands else (counts[number] - first[number]) / (sync - begin)
             velocities.append(axis.scale.sign * rate / axis.scale.counts_per_rad)
         self._standing = not any(velocities)

@@ -121,7 +121,7 @@ def _state(axis: Axis) -> Finding:
     if axis.state in IN_FAULT:
         kept = f", {axis.last_error}" if axis.last_error else ""
         return Finding(subject, f"{axis.state}{kept}", "problem", "see to the drive, then dualcal reset")
-    return Finding(subject, str(axis.state))
+    return Finding(subject, axis.condition)
 
 
 def _limits(axis: Axis, record: DriveRecord) -> str:

@@ -73,6 +73,8 @@ AT_ONCE = 0x0020
 """Bit of the controlword in profile position mode: the target replaces the one under way."""
 HALT = 0x0100
 """Bit of the controlword: slow down and stand, stay enabled."""
+VOLTAGE = 0x0010
+"""Bit of the statusword: there is voltage for the motor."""
 TARGET_REACHED = 0x0400
 """Bit of the statusword: arrived; with HALT, standing."""
 SET_POINT_TAKEN = 0x1000

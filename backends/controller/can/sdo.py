@@ -33,8 +33,8 @@ class SdoNode:
     def __init__(self, device: str, joint: int, node: int, send: Callable[[int, bytes], None]) -> None:
         self._device = device
         self.name = f"joint {joint} (node {node})"
-        objects = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
-        self._client = SdoClient(SDO_REQUEST + node, SDO_ANSWER + node, objects)  # type: ignore[no-untyped-call]
+        objects = canopen.ObjectDictionary()
+        self._client = SdoClient(SDO_REQUEST + node, SDO_ANSWER + node, objects)
         self._client.network = _Network(send)
         self._client.RESPONSE_TIMEOUT = _ANSWER
         # Two requests at once of one client take each other's answers.
@@ -43,7 +43,7 @@ class SdoNode:
     def answered(self, data: bytes) -> None:
         """Its answer has arrived (called by the bus's reader); frames of other than 8 bytes are none."""
         if len(data) == 8:
-            self._client.on_response(0, data, 0.0)  # type: ignore[no-untyped-call]
+            self._client.on_response(0, data, 0.0)
 
     def read(self, index: int, subindex: int = 0) -> bytes:
         """CommandRefused where the node aborts it (there is no such object), DeviceTimeout where it does not answer."""

@@ -36,6 +36,7 @@ from backends.controller.can.objects import (
 )
 from backends.controller.can.profile import follow_waypoints
 from backends.controller.can.sdo import SdoNode
+from backends.controller.can.statistics import CycleReport
 from backends.controller.can.transport import BusAddress, Transport
 from backends.controller.course import Course
 from backends.controller.link import ArmLink, ArmReport, Transfer
@@ -357,7 +358,7 @@ class CanArmLink(ArmLink):
             raise CommandRefused(self.arm, "move", why, "see to it, then plan the motion anew")
 
     def _why_not_ready(self, cycle: Cycle) -> str:
-        off = [f"{axis.name} is {axis.state}" for axis in self._axes if axis.state is not State.OPERATION_ENABLED]
+        off = [f"{axis.name} is {axis.condition}" for axis in self._axes if axis.state is not State.OPERATION_ENABLED]
         if off:
             return ", ".join(off)
         if self._report is None or self._report.faults:
@@ -420,7 +421,7 @@ class CanArmLink(ArmLink):
 
     def _why_not_ready_after(self, axes: Sequence[Axis]) -> str:
         return ", ".join(
-            f"{axis.name} is {axis.state}, mode {axis.feedback.operation if axis.feedback else 'unknown'}"
+            f"{axis.name} is {axis.condition}, mode {axis.feedback.operation if axis.feedback else 'unknown'}"
             for axis in axes
             if axis.state is not State.OPERATION_ENABLED or not self._is_in_mode(axis)
         )
@@ -459,6 +460,10 @@ class CanArmLink(ArmLink):
             cycle.forget_emergencies()
 
     # What an operator is told.
+
+    def cycle_report(self) -> CycleReport:
+        """How well the cycle has kept its time since it was last connected. NotOpen, LinkLost."""
+        return self._running("measure").statistics.report()
 
     def findings(self) -> list[Finding]:
         cycle, records = self._cycle, self._records

@@ -1,20 +1,21 @@
-"""CAN frames in and out of one bus, by python-can.
+"""CAN frames in and out of one bus.
 
-Opens a bus with exact options, stamps what arrives on the clock, and hands it over; whatever python-can or a vendor's
+Opens it with exact options, stamps what arrives on the clock, and hands it over; whatever python-can or a vendor's
 library raises becomes an error of ours.
 """
 
 from __future__ import annotations
 
 import logging
-import socket
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import can
 
+from backends.controller.can.promptness import prompt_thread
+from backends.controller.can.socketcand import Frame, SocketcandWire, address_of
 from dualcal_hal.clock import Clock
 from dualcal_hal.errors import CommandRefused, DeviceError, DeviceTimeout, LinkLost
 
@@ -52,6 +53,41 @@ class BusStatistics:
     error_frames: int = 0
 
 
+class Wire(Protocol):
+    """A bus that is open. One thread receives, one at a time sends; they raise whatever their library does."""
+
+    def send(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """Frames (identifier, data), in their order."""
+
+    def receive(self, timeout: float) -> list[Frame]:
+        """What has arrived, after waiting for up to ``timeout`` s for it."""
+
+    def close(self) -> None: ...
+
+
+class PythonCanWire:
+    """A bus of any of python-can's interfaces."""
+
+    def __init__(self, address: BusAddress) -> None:
+        options: dict[str, Any] = {} if address.bitrate is None else {"bitrate": address.bitrate}
+        # python-can takes any misspelt option without a word, so there are no others; and without ignore_config it
+        # would mix in settings of the home folder and the environment.
+        self._bus = can.Bus(interface=address.interface, channel=address.channel, ignore_config=True, **options)
+
+    def send(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        for identifier, data in frames:
+            self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+    def receive(self, timeout: float) -> list[Frame]:
+        message = self._bus.recv(timeout)
+        if message is None or message.is_remote_frame or (message.is_extended_id and not message.is_error_frame):
+            return []
+        return [Frame(message.arbitration_id, bytes(message.data), message.is_error_frame)]
+
+    def close(self) -> None:
+        self._bus.shutdown()
+
+
 Dispatch = Callable[[int, bytes, float], None]
 
 
@@ -69,7 +105,7 @@ class Transport:
         self._clock = clock
         self._dispatch = dispatch
         self._on_loss = on_loss
-        self._bus: can.BusABC | None = None
+        self._wire: Wire | None = None
         self._sending = threading.Lock()
         self._closing = threading.Event()
         self._reader: threading.Thread | None = None
@@ -77,57 +113,55 @@ class Transport:
 
     def open(self, deadline: float) -> None:
         """Open the bus. DeviceTimeout, LinkLost, CommandRefused (an option that does not fit)."""
-        self._bus = _open_bus(self._device, self._address, self._clock, deadline)
+        self._wire = _opened(self._device, self._address, self._clock, deadline)
         self._closing.clear()
         self.statistics = BusStatistics()
-        self._reader = threading.Thread(target=self._read, args=(self._bus,), name=f"{self._device} CAN reader")
-        self._reader.daemon = True
+        name = f"{self._device} CAN reader"
+        self._reader = threading.Thread(target=self._read, args=(self._wire,), name=name, daemon=True)
         self._reader.start()
 
     def close(self) -> None:
         """End the reader and release the bus; any number of times."""
         self._closing.set()
-        reader, bus = self._reader, self._bus
+        reader = self._reader
         if reader is not None and reader is not threading.current_thread():
             reader.join()
         with self._sending:
-            self._bus = self._reader = None
-        if bus is not None:
-            _shut_down(bus)
+            wire, self._wire, self._reader = self._wire, None, None
+        if wire is not None:
+            _release(wire)
 
     def send(self, identifier: int, data: bytes) -> None:
         """LinkLost where the bus does not take it."""
         self.send_all(((identifier, data),))
 
-    def send_all(self, frames: Iterable[tuple[int, bytes]]) -> None:
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
         """Frames in their order, no other between them. LinkLost where the bus does not take one."""
         with self._sending:
-            if (bus := self._bus) is None:
+            if (wire := self._wire) is None:
                 raise LinkLost(self._device, "send", "the bus is closed")
-            for identifier, data in frames:
-                message = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
-                try:
-                    bus.send(message)
-                except Exception as error:  # vendors' libraries raise anything
-                    raise self._lost("send", error) from error
-                self.statistics.sent += 1
+            try:
+                wire.send(frames)
+            except Exception as error:  # vendors' libraries raise anything
+                raise self._lost("send", error) from error
+            self.statistics.sent += len(frames)
 
-    def _read(self, bus: can.BusABC) -> None:
+    def _read(self, wire: Wire) -> None:
         try:
-            while not self._closing.is_set():
-                message = bus.recv(_RECEIVE)
-                if message is not None:
-                    self._take(message, self._clock.now())
+            with prompt_thread():
+                while not self._closing.is_set():
+                    self._take(wire.receive(_RECEIVE), self._clock.now())
         except Exception as error:  # noqa: BLE001 - whatever ends the reader must be told
             if not self._closing.is_set():
                 self._on_loss(self._lost("receive", error))
 
-    def _take(self, message: can.Message, arrival: float) -> None:
-        self.statistics.received += 1
-        if message.is_error_frame:
-            self.statistics.error_frames += 1
-        elif not (message.is_remote_frame or message.is_extended_id):
-            self._dispatch(message.arbitration_id, bytes(message.data), arrival)
+    def _take(self, frames: list[Frame], arrival: float) -> None:
+        self.statistics.received += len(frames)
+        for frame in frames:
+            if frame.is_error:
+                self.statistics.error_frames += 1
+            else:
+                self._dispatch(frame.identifier, frame.data, arrival)
 
     def _lost(self, attempted: str, error: Exception) -> LinkLost:
         return LinkLost(
@@ -138,111 +172,84 @@ class Transport:
         )
 
 
-def socketcand_address(channel: str) -> tuple[str, int, str]:
-    """Host, port and bus of ``HOST:PORT/BUS``; ValueError if it is none."""
-    place, slash, bus = channel.partition("/")
-    host, colon, port = place.rpartition(":")
-    if not (slash and colon and host and bus and port.isdecimal() and 0 < int(port) < 65536):
-        raise ValueError(f"must be HOST:PORT/BUS, as 192.168.0.5:29536/can0, not {channel}")
-    return host.removeprefix("[").removesuffix("]"), int(port), bus
-
-
-def _options(address: BusAddress) -> dict[str, Any]:
-    """What python-can is given; it takes any misspelt option without a word, so nothing else goes there."""
-    if address.bitrate is not None and (elsewhere := _BITRATE_ELSEWHERE.get(address.interface)) is not None:
-        raise ValueError(f"bitrate is no option of {address.interface}: {elsewhere}")
-    options: dict[str, Any] = {"interface": address.interface, "channel": address.channel}
-    if address.interface == "socketcand":
-        host, port, bus = socketcand_address(address.channel)
-        # Without tcp_tune each answer may wait 40 ms for an acknowledgement.
-        options |= {"host": host, "port": port, "channel": bus, "tcp_tune": True}
-    if address.bitrate is not None:
-        options["bitrate"] = address.bitrate
-    return options
-
-
-def _open_bus(device: str, address: BusAddress, clock: Clock, deadline: float) -> can.BusABC:
-    try:
-        options = _options(address)
-    except ValueError as error:
-        raise CommandRefused(device, "open the bus", str(error), "correct the cell file") from error
+def _refuse_unless_exact(device: str, address: BusAddress) -> None:
+    """Options that do not fit the interface are errors, as misspelt ones are in the cell file."""
+    why, advice = "", "correct the cell file"
     if address.interface not in can.VALID_INTERFACES:
-        known = ", ".join(sorted(can.VALID_INTERFACES))
-        raise CommandRefused(
-            device, "open the bus", f"python-can has no interface {address.interface}", f"it has {known}"
+        why, advice = (
+            f"python-can has no interface {address.interface}",
+            "it has " + ", ".join(sorted(can.VALID_INTERFACES)),
         )
-    if address.interface == "socketcand":
-        _greet(device, options["host"], options["port"], deadline - clock.now())
-    opening = _Opening(options)
-    if not clock.wait(opening.done, deadline):
-        opening.abandon()
-        raise DeviceTimeout(device, "open the bus", f"{address} did not open in time", "check the adapter")
-    if opening.bus is None:
-        raise LinkLost(
-            device, "open the bus", f"{address}: {_words(opening.error)}", _advice(address)
-        ) from opening.error
-    return opening.bus
+    elif address.bitrate is not None and address.interface in _BITRATE_ELSEWHERE:
+        why = f"bitrate is no option of {address.interface}: {_BITRATE_ELSEWHERE[address.interface]}"
+    elif address.interface == "socketcand":
+        try:
+            address_of(address.channel)
+        except ValueError as error:
+            raise CommandRefused(device, "open the bus", f"channel {error}", advice) from error
+    if why:
+        raise CommandRefused(device, "open the bus", why, advice)
+
+
+def _opened(device: str, address: BusAddress, clock: Clock, deadline: float) -> Wire:
+    _refuse_unless_exact(device, address)
+    timeout = max(0.01, deadline - clock.now())
+    opening = _Opening(address, timeout)
+    late = not clock.wait(opening.done, deadline)
+    if late and opening.abandon():
+        raise DeviceTimeout(device, "open the bus", f"{address} did not open in time", _advice(address))
+    if opening.wire is not None:
+        return opening.wire
+    error = DeviceTimeout if isinstance(opening.error, TimeoutError) else LinkLost
+    raise error(device, "open the bus", f"{address}: {_words(opening.error)}", _advice(address)) from opening.error
 
 
 class _Opening:
-    """A bus that is being opened, on a thread of its own: libraries may take as long as they like."""
+    """A bus that is being opened, on a thread of its own: libraries take as long as they like."""
 
-    def __init__(self, options: dict[str, Any]) -> None:
-        self.bus: can.BusABC | None = None
+    def __init__(self, address: BusAddress, timeout: float) -> None:
+        self.wire: Wire | None = None
         self.error: Exception | None = None
         self.done = threading.Event()
         self._abandoned = False
         self._lock = threading.Lock()
-        threading.Thread(target=self._open, args=(options,), name="CAN bus opening", daemon=True).start()
+        threading.Thread(target=self._open, args=(address, timeout), name="CAN bus opening", daemon=True).start()
 
-    def _open(self, options: dict[str, Any]) -> None:
+    def _open(self, address: BusAddress, timeout: float) -> None:
         try:
-            # Else settings in the home folder and the environment would be mixed in.
-            bus = can.Bus(ignore_config=True, **options)
+            wire: Wire = (
+                SocketcandWire(address.channel, timeout)
+                if address.interface == "socketcand"
+                else PythonCanWire(address)
+            )
         except Exception as error:  # noqa: BLE001 - a missing vendor library raises anything
             self.error = error
         else:
             with self._lock:
                 if self._abandoned:
-                    _shut_down(bus)
+                    _release(wire)
                 else:
-                    self.bus = bus
+                    self.wire = wire
         self.done.set()
 
-    def abandon(self) -> None:
-        """Nobody waits for it any more."""
+    def abandon(self) -> bool:
+        """Nobody waits for it any more; whether it really is not done."""
         with self._lock:
-            self._abandoned = True
-            if self.bus is not None:
-                _shut_down(self.bus)
-
-
-def _greet(device: str, host: str, port: int, timeout: float) -> None:
-    """Is a socketcand there at all? python-can would try for ten seconds, and wait for its greeting for ever."""
-    try:
-        with socket.create_connection((host, port), timeout=max(timeout, 0.01)) as probe:
-            greeting = probe.recv(16)
-    except TimeoutError as error:
-        raise DeviceTimeout(
-            device, "open the bus", f"no socketcand answers at {host}:{port}", "is it running?"
-        ) from error
-    except OSError as error:
-        raise LinkLost(
-            device, "open the bus", f"no socketcand at {host}:{port}: {error.strerror or error}", "is it running?"
-        ) from error
-    if not greeting.startswith(b"< hi >"):
-        raise LinkLost(device, "open the bus", f"what listens at {host}:{port} is no socketcand", "check the channel")
+            self._abandoned = not self.done.is_set() and self.wire is None
+            return self._abandoned
 
 
 def _advice(address: BusAddress) -> str:
     if address.interface == "socketcan":
         return f"is the interface there and up? ip link show {address.channel}"
+    if address.interface == "socketcand":
+        return "is socketcand running there, and does it serve this bus?"
     return "is the adapter there, and its driver or library installed?"
 
 
-def _shut_down(bus: can.BusABC) -> None:
+def _release(wire: Wire) -> None:
     try:
-        bus.shutdown()
+        wire.close()
     except Exception:  # noqa: BLE001 - it is given up; what a library says of that is of no use
         return
 

@@ -29,8 +29,9 @@ TEMPERATURE, OVERCURRENT = 0x4210, 0x2310
 VICTIM = 2
 """The joint that faults befall where none is named."""
 
-_FOLLOWING_WINDOW, _POSITION_WINDOW = 0.2, 1e-3
-"""Radians, where the master sets none: a drive that is farther off has a fault, one that is nearer has arrived."""
+_FOLLOWING_TIME, _POSITION_WINDOW = 0.06, 1e-3
+"""Where the master sets none: an axis that is behind by more than its way in so many seconds at full speed has a fault,
+one that is nearer than so many radians has arrived."""
 
 _SYNCS_GO_ON = 0.025  # s within which the next SYNC does what a tick would
 
@@ -189,7 +190,7 @@ class ArmDrives:
         )
         return [
             {
-                0x6065: int(_FOLLOWING_WINDOW * counts),
+                0x6065: int(_FOLLOWING_TIME * v * counts),
                 0x6067: int(_POSITION_WINDOW * counts) + 1,
                 0x6081: int(v * counts) + 1,
                 **dict.fromkeys((0x6083, 0x6084, 0x6085), int(a * counts) + 1),

@@ -157,30 +157,38 @@ class Hub:
             self._waker.send(b"\0")
             if self._thread.ident is not None:
                 self._thread.join()
-            for client in self._clients:
-                client.socket.close()
             for what in (self._selector, self._listener, self._waker, self._woken):
                 what.close()
 
     def _run(self) -> None:
-        next_tick = self._clock.now()
-        while not self._closing:
-            ready = self._selector.select(max(0.0, next_tick - self._clock.now()))
-            # First of all: what was asked for before a frame was sent is done before it is heard.
-            while not self._calls.empty():
-                self._calls.get()()
-            for key, _ in ready:
-                if key.data is not None:
-                    self._hear(key.data)
-                elif key.fileobj is self._listener:
-                    self._welcome()
-                else:
-                    self._woken.recv(4096)
-            if (now := self._clock.now()) >= next_tick:
-                next_tick = max(next_tick + TICK, now)
-                for tick in self._ticks:
-                    tick(now)
-            self._flush()
+        try:
+            next_tick = self._clock.now()
+            while not self._closing:
+                next_tick = self._turn(next_tick)
+        finally:
+            # Whatever ends it, nobody is left to wait for frames that do not come.
+            for client in self._clients:
+                client.socket.close()
+
+    def _turn(self, next_tick: float) -> float:
+        """Do what has come, or wait for it until the next tick; returns when that is."""
+        ready = self._selector.select(max(0.0, next_tick - self._clock.now()))
+        # First of all: what was asked for before a frame was sent is done before it is heard.
+        while not self._calls.empty():
+            self._calls.get()()
+        for key, _ in ready:
+            if key.data is not None:
+                self._hear(key.data)
+            elif key.fileobj is self._listener:
+                self._welcome()
+            else:
+                self._woken.recv(4096)
+        if (now := self._clock.now()) >= next_tick:
+            next_tick = max(next_tick + TICK, now)
+            for tick in self._ticks:
+                tick(now)
+        self._flush()
+        return next_tick
 
     def _flush(self) -> None:
         for client in self._clients:

@@ -142,6 +142,103 @@ def replay(
     raise typer.Exit(code)
 
 
+@app.command()
+def doctor(
+    cell: Cell,
+    flange: Annotated[
+        bool,
+        typer.Option("--flange", help="Hold the flange's poses as the pendant shows them against our kinematics."),
+    ] = False,
+    wiggle: Annotated[
+        bool, typer.Option("--wiggle", help="Turn each joint by 1 degree and back: it proves order and sign.")
+    ] = False,
+    arm: Annotated[str | None, typer.Option(help="For --flange and --wiggle: one arm. Default: both.")] = None,
+    rotation: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FORM",
+            help="For --flange: what the pendant shows of an orientation: rotation-vector, abb (quaternion), fanuc "
+            "(W P R), kuka (A B C) or motoman (Rx Ry Rz).",
+        ),
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="For --flange: JSON or CSV, in place of typing them.")
+    ] = None,
+    within_mm: Annotated[float, typer.Option(min=0.1, help="For --flange: usual difference between models, mm.")] = 3.0,
+    within_deg: Annotated[float, typer.Option(min=0.01, help="For --flange: the same, degrees.")] = 0.5,
+    enable: Annotated[bool, typer.Option("--enable", help="For --wiggle: switch the drives on before.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="For --wiggle: begin without asking.")] = False,
+    overrides: Set = None,
+    json: Annotated[bool, typer.Option("--json", help="Print a JSON document alone on standard output.")] = False,
+) -> None:
+    """Look at each device in turn and say how it is; nothing is moved and nothing is switched on, but by --wiggle.
+
+    On a cell that is not simulated --flange and --wiggle of both arms come before its first run. Exit code 0 if all is
+    good, 1 if not, 2 for a call or cell file that cannot be used, 130 when interrupted.
+    """
+    with ended_in_order():
+        from tools.cli.doctor import DoctorOptions, diagnose
+
+        options = DoctorOptions(
+            cell,
+            tuple(overrides or ()),
+            flange,
+            wiggle,
+            arm,
+            rotation,
+            poses,
+            (within_mm, within_deg),
+            enable,
+            yes,
+            json,
+        )
+        code = diagnose(options)
+    raise typer.Exit(code)
+
+
+Arm = Annotated[str, typer.Option("--arm", help="The arm, by its name in the cell file.", show_default=False)]
+Yes = Annotated[bool, typer.Option("--yes", help="Do it without asking.")]
+
+
+@app.command()
+def enable(cell: Cell, arm: Arm, yes: Yes = False, overrides: Set = None) -> None:
+    """Switch an arm's drives on, and say how it is afterwards.
+
+    Exit code 0 if it is ready and stays so, 1 if not, 2 for a call that cannot be carried out or is not confirmed.
+    """
+    with ended_in_order():
+        from tools.cli.operate import OperateOptions, operate
+
+        code = operate(OperateOptions("enable", cell, arm, tuple(overrides or ()), yes))
+    raise typer.Exit(code)
+
+
+@app.command()
+def disable(cell: Cell, arm: Arm, yes: Yes = False, overrides: Set = None) -> None:
+    """Switch an arm's drives off, and say how it is afterwards.
+
+    Exit code 0 if they are off, 1 if not, 2 for a call that cannot be carried out or is not confirmed.
+    """
+    with ended_in_order():
+        from tools.cli.operate import OperateOptions, operate
+
+        code = operate(OperateOptions("disable", cell, arm, tuple(overrides or ()), yes))
+    raise typer.Exit(code)
+
+
+@app.command()
+def reset(cell: Cell, arm: Arm, yes: Yes = False, overrides: Set = None) -> None:
+    """Acknowledge an arm's faults, and say how it is afterwards; its drives stay off.
+
+    Exit code 0 if no fault is left, 1 if one is, 2 for a call that cannot be carried out or is not confirmed.
+    """
+    with ended_in_order():
+        from tools.cli.operate import OperateOptions, operate
+
+        code = operate(OperateOptions("reset", cell, arm, tuple(overrides or ()), yes))
+    raise typer.Exit(code)
+
+
 @app.command("serve-camera")
 def serve_camera(
     cell: Cell,
@@ -186,6 +283,32 @@ def schema() -> None:
         typer.echo(json.dumps(cell_schema(), indent=2))
 
 
+intrinsics_app = typer.Typer(help="The camera's matrix and distortion.", no_args_is_help=True)
+app.add_typer(intrinsics_app, name="intrinsics")
+
+
+@intrinsics_app.callback()
+def _intrinsics() -> None:
+    """A group, though it has one command: dualcal run --procedure intrinsics finds them."""
+
+
+@intrinsics_app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="OpenCV's YAML or JSON, or ROS's camera_info YAML.")],
+    cell: Annotated[Path, typer.Option(help="The cell file whose camera it is.")],
+    out: Annotated[Path | None, typer.Option(help="Where to write the lines for the cell file.")] = None,
+    overrides: Set = None,
+) -> None:
+    """Turn another program's camera file into the lines for a cell file.
+
+    Exit code 0, 2 for a file that cannot be used, or is of images of another size than the cell's.
+    """
+    with ended_in_order():
+        from tools.cli.intrinsics import import_intrinsics
+
+        import_intrinsics(file, cell, out, tuple(overrides or ()))
+
+
 @app.command()
 def emulate(
     cell: Cell,
@@ -219,32 +342,6 @@ def emulate(
         from tools.cli.emulate import emulate as serve
 
         serve(EmulateOptions(cell, tuple(overrides or ()), tuple(fault or ()), free_ports, until_stdin_closes))
-
-
-intrinsics_app = typer.Typer(help="The camera's matrix and distortion.", no_args_is_help=True)
-app.add_typer(intrinsics_app, name="intrinsics")
-
-
-@intrinsics_app.callback()
-def _intrinsics() -> None:
-    """A group, though it has one command: dualcal run --procedure intrinsics finds them."""
-
-
-@intrinsics_app.command("import")
-def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="OpenCV's YAML or JSON, or ROS's camera_info YAML.")],
-    cell: Annotated[Path, typer.Option(help="The cell file whose camera it is.")],
-    out: Annotated[Path | None, typer.Option(help="Where to write the lines for the cell file.")] = None,
-    overrides: Set = None,
-) -> None:
-    """Turn another program's camera file into the lines for a cell file.
-
-    Exit code 0, 2 for a file that cannot be used, or is of images of another size than the cell's.
-    """
-    with ended_in_order():
-        from tools.cli.intrinsics import import_intrinsics
-
-        import_intrinsics(file, cell, out, tuple(overrides or ()))
 
 
 log_app = typer.Typer(help="Look at, check, repair and export the log of a session.", no_args_is_help=True)

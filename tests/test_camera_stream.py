@@ -181,7 +181,7 @@ def test_a_sender_that_never_tells_when_it_heard_of_a_mark_proves_nothing(monkey
         opened(stream(deaf.endpoint)) as backend,
         pytest.raises(DeviceTimeout, match="for none of them it is proven"),
     ):
-        backend.camera("camera").grab(CLOCK.now(), 0.5)
+        backend.camera("camera").grab(CLOCK.now(), 1.0)
 
 
 def test_a_frame_that_cannot_come_in_time_is_a_timeout(sender: Sender) -> None:

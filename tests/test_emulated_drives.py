@@ -517,6 +517,15 @@ def test_all_drives_of_an_arm_are_commanded_together() -> None:
     assert [q.tolist() for q in rig.motors.commands] == [[0.01, 0.02, 0.03]]
 
 
+def test_it_is_told_that_an_arm_is_sent_elsewhere_and_only_then(rig: Rig) -> None:
+    sent: list[float] = []
+    rig.drives.on_target = lambda: sent.append(float(rig.motors.q[0]))
+    rig.enable()
+    for target in (10, 10, 20):
+        rig.cycle(0x0F, target)
+    assert sent == [0.01, 0.02]
+
+
 # Over wires, with canopen's master
 
 

@@ -234,6 +234,16 @@ def test_a_lost_bus_puts_its_clients_out_and_takes_none_until_it_is_mended(hub: 
             pass
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_hub_that_fails_leaves_nobody_waiting(hub: Hub) -> None:
+    def fail() -> None:
+        raise RuntimeError("nobody expects this")
+
+    with Client(hub, "left") as client:
+        hub.soon(fail)
+        assert client.line() == ""
+
+
 def test_it_is_closed_any_number_of_times_started_or_not() -> None:
     hub = Hub(RealClock(), ["left"])
     hub.close()

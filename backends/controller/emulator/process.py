@@ -95,6 +95,7 @@ class Emulator:
                 raise UsageError(f"{_LOOPBACK}:{port}: cannot be listened to: {error.strerror}") from error
             opening.callback(buses.close)
             for arm in arms:
+                buses.arms[arm].on_target = partial(schedule.pointed, arm)
                 world.on_contact(_struck(buses, arm))
                 for fault in FAULTS:
                     schedule.attach(fault, arm, partial(buses.strike, fault, arm))

@@ -16,7 +16,7 @@ from dualcal_hal.transforms import Array, rotation_from_vector, transform
 from procedures.estimation.projection import project
 from procedures.intrinsics import SeenView, intrinsics_result
 from procedures.intrinsics.coverage import LEAST_SHARE, Coverage, tilts_of
-from procedures.intrinsics.estimate import NAMES, SIGNIFICANT, estimate, information, parameters
+from procedures.intrinsics.estimate import NAMES, SIGNIFICANT, estimate, information_of, parameters
 from procedures.intrinsics.report import intrinsics_figure
 from procedures.intrinsics.result import patch, set_options, settings
 from procedures.intrinsics.views import Shown, ViewPlanner
@@ -85,9 +85,9 @@ def result_of(corners: list[Array], **of_camera: float):
 
 def test_exact_corners_give_the_exact_camera_from_one_that_is_wrong_by_5_percent_and_20_px():
     found = estimate(views(36, noise=0.0), BOARD, WRONG)
-    np.testing.assert_allclose(found.intrinsics.matrix, CAMERA.matrix, atol=5e-3)  # OpenCV takes corners as floats
-    np.testing.assert_allclose(found.intrinsics.distortion, CAMERA.distortion, atol=2e-5)
-    assert found.rms < 1e-4
+    np.testing.assert_allclose(found.intrinsics.matrix, CAMERA.matrix, atol=1e-6)
+    np.testing.assert_allclose(found.intrinsics.distortion, CAMERA.distortion, atol=1e-8)
+    assert found.rms < 1e-8
 
 
 @pytest.mark.parametrize("camera", [CAMERA, PINHOLE], ids=["lens", "pinhole"])
@@ -117,7 +117,7 @@ def test_what_cannot_be_told_is_zero_and_keeps_its_sigma():
     assert parameters(found.intrinsics)[k3] == 0.0
     assert found.sigma[k3] > 0.0
     # It is not known to be zero: the sigmas of the others are those with it free.
-    total = sum(information(T, BOARD.corners, found.intrinsics) for T in found.poses)
+    total = sum(information_of(T, BOARD.corners, found.intrinsics) for T in found.poses)
     expected = np.sqrt(np.diag(np.linalg.inv(total))) * NOISE
     np.testing.assert_allclose(found.sigma, expected, rtol=0.15)
 

@@ -1,8 +1,6 @@
 """Camera matrix and distortion from views of a plane (Z. Zhang, A Flexible New Technique for Camera Calibration, 2000).
 
-OpenCV finds the least-squares solution; sigmas are worked out here, as its own do not count each corner as two
-measurements in all versions, nor say how the parameters go together. The arms' joint angles are no part of it: errors
-of their kinematics shall not become errors of the lens.
+The arms' joint angles are no part of it: errors of their kinematics shall not become errors of the lens.
 """
 
 from __future__ import annotations
@@ -11,16 +9,16 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from cv2.typing import MatLike
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from dualcal_hal.camera import Intrinsics
 from dualcal_hal.errors import DegenerateCaptures
 from dualcal_hal.target import Target
-from dualcal_hal.transforms import Array, transform
+from dualcal_hal.transforms import Array, rotation_from_vector, transform, vector_from_rotation
+from procedures.detection import board_poses
+from procedures.intrinsics.adjustment import Adjusted, SeenCorners, adjust, information, project_with_jacobian
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """The parameters in the order of arrays of them; the first four in px."""
@@ -41,12 +39,11 @@ _STRAY_PX = 0.1
 _MOST_STRAY = 0.2
 """Share of the views that may go astray; more are not left out, and the rms tells."""
 
-_MATRIX, _COEFFICIENTS = slice(0, 4), slice(4, 9)
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 _RADIAL: tuple[tuple[str, ...], ...] = ((), ("k3",), ("k2", "k3"), ("k1", "k2", "k3"))
 _TANGENTIAL: tuple[tuple[str, ...], ...] = ((), ("p1", "p2"))
 _FIXABLE = [pair for pair in itertools.product(_RADIAL, _TANGENTIAL) if any(pair)]
-_FLAGS = {"k1": cv2.CALIB_FIX_K1, "k2": cv2.CALIB_FIX_K2, "k3": cv2.CALIB_FIX_K3, "p1": cv2.CALIB_FIX_TANGENT_DIST}
+_TURNS = 3
+"""Times that views are looked at for whether the target leans the other way, which from afar looks nearly the same."""
 _NOT_INVERTIBLE = 1e12
 
 
@@ -128,25 +125,9 @@ def parameters(intrinsics: Intrinsics) -> Array:
     return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *intrinsics.distortion])
 
 
-def information(T_E_T: Array, points: Array, intrinsics: Intrinsics) -> Array:
-    """(9, 9): what the corners at ``points`` (n, 3) in T say of the parameters, for a sigma of 1 px per axis.
-
-    Their pose is not known and found from the same corners (Schur's complement takes it out).
-    """
-    rotation, _ = cv2.Rodrigues(T_E_T[:3, :3])
-    return _information(_jacobian(rotation, T_E_T[:3, 3], points, intrinsics))
-
-
-def _jacobian(rotation: MatLike, translation: MatLike, points: Array, intrinsics: Intrinsics) -> Array:
-    """(2n, 15): of the pixels, by the pose (6), then by the parameters in the order of NAMES."""
-    _, J = cv2.projectPoints(points, rotation, translation, intrinsics.matrix, intrinsics.distortion)
-    return np.asarray(J[:, :15], dtype=float)
-
-
-def _information(J: Array) -> Array:
-    pose, of_camera = J[:, :6], J[:, 6:]
-    across = pose.T @ of_camera
-    return np.asarray(of_camera.T @ of_camera - across.T @ np.linalg.pinv(pose.T @ pose) @ across)
+def information_of(T_E_T: Array, points: Array, intrinsics: Intrinsics) -> Array:
+    """(9, 9): what the corners at ``points`` (n, 3) in T say of the parameters, for a sigma of 1 px per axis."""
+    return information(project_with_jacobian(points, _pose_of(T_E_T), parameters(intrinsics))[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,57 +142,78 @@ class _Views:
     def solve(self, used: NDArray[np.bool_], start: Intrinsics, fixed: tuple[str, ...]) -> Estimate:
         """Of the ``used`` views (k,)."""
         chosen = np.flatnonzero(used)
-        flags = cv2.CALIB_USE_INTRINSIC_GUESS | sum(_FLAGS.get(name, 0) for name in fixed)
-        distortion = np.where(np.isin(NAMES[_COEFFICIENTS], fixed), 0.0, start.distortion)
-        objects = [self.board.corners[self.seen[i]].astype(np.float32) for i in chosen]
-        pixels = [self.corners[i][self.seen[i]].astype(np.float32) for i in chosen]
-        try:
-            _, matrix, distortion, rotations, translations = cv2.calibrateCamera(
-                objects, pixels, self.size, start.matrix.copy(), distortion, flags=flags, criteria=_CRITERIA
+        free = np.array([name not in fixed for name in NAMES])
+        views = [self._seen(int(i)) for i in chosen]
+        found = Adjusted(np.where(free, parameters(start), 0.0), self._poses(chosen, start))
+        for _ in range(_TURNS):
+            found = adjust(views, found, free)
+            turned = self._poses(chosen, self._intrinsics(found.parameters))
+            better = (
+                self._squares(views, found.parameters, turned)
+                < self._squares(views, found.parameters, found.poses) * _TURNED
             )
-        except cv2.error as error:
-            raise DegenerateCaptures(f"intrinsics: the views determine no camera: {error.err}") from error
-        intrinsics = Intrinsics(np.asarray(matrix, dtype=float), np.ravel(distortion)[:5].astype(float), self.size)
-        if not all(np.all(np.isfinite(values)) for values in (matrix, distortion, rotations, translations)):
-            raise DegenerateCaptures("intrinsics: the views determine no camera")
-        poses = np.full((len(used), 4, 4), np.nan)
-        for i, rotation, translation in zip(chosen, rotations, translations, strict=True):
-            poses[i] = transform(cv2.Rodrigues(rotation)[0], np.ravel(translation))
-        return self._judged(intrinsics, poses, used, fixed)
+            if not np.any(better):
+                break
+            found = Adjusted(found.parameters, np.where(better[:, None], turned, found.poses))
+        every = np.full((len(used), _POSE_NUMBERS), np.nan)
+        every[chosen] = found.poses
+        return self._judged(self._intrinsics(found.parameters), every, used, fixed)
+
+    def _seen(self, i: int) -> SeenCorners:
+        return SeenCorners(self.board.corners[self.seen[i]], self.corners[i][self.seen[i]])
+
+    def _poses(self, chosen: NDArray[np.intp], camera: Intrinsics) -> Array:
+        """(k, 6) of the better of the poses that each view has for itself."""
+        return np.array([_pose_of(board_poses(self.corners[i], self.board, camera)[0][0]) for i in chosen])
+
+    def _squares(self, views: Sequence[SeenCorners], camera: Array, poses: Array) -> Array:
+        return np.array([np.sum(_residuals(view, pose, camera) ** 2) for view, pose in zip(views, poses, strict=True)])
+
+    def _intrinsics(self, values: Array) -> Intrinsics:
+        fx, fy, cx, cy = values[:4]
+        return Intrinsics(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), values[4:].copy(), self.size)
 
     def _judged(
         self, intrinsics: Intrinsics, poses: Array, used: NDArray[np.bool_], fixed: tuple[str, ...]
     ) -> Estimate:
-        residuals = np.full_like(self.corners, np.nan)
-        total = np.zeros((len(NAMES), len(NAMES)))
-        for i in np.flatnonzero(self.seen.sum(axis=1) >= 4):
-            points, pixels = self.board.corners[self.seen[i]], self.corners[i][self.seen[i]]
+        camera = parameters(intrinsics)
+        residuals, total = np.full_like(self.corners, np.nan), np.zeros((len(NAMES), len(NAMES)))
+        view_rms = np.full(len(used), np.nan)
+        for i in np.flatnonzero(self.seen.sum(axis=1) >= LEAST_CORNERS):
+            view = self._seen(int(i))
             if used[i]:
-                rotation, translation = cv2.Rodrigues(poses[i, :3, :3])[0], poses[i, :3, 3]
-                total += _information(_jacobian(rotation, translation, points, intrinsics))
-            else:
-                rotation, translation = _pose(points, pixels, intrinsics)
-            explained, _ = cv2.projectPoints(points, rotation, translation, intrinsics.matrix, intrinsics.distortion)
-            residuals[i][self.seen[i]] = pixels - explained.reshape(-1, 2)
-        squares = np.nansum(residuals[used] ** 2)
+                total += information(project_with_jacobian(view.points, poses[i], camera)[1])
+            pose = poses[i] if used[i] else self._poses(np.array([i]), intrinsics)[0]
+            left = _residuals(view, pose, camera)
+            residuals[i][self.seen[i]] = left
+            view_rms[i] = np.sqrt(np.mean(left**2))
+        squares = float(np.nansum(residuals[used] ** 2))
         measured = 2 * int(self.seen[used].sum())
         free = np.array([name not in fixed for name in NAMES])
-        unknowns = 6 * int(used.sum()) + int(free.sum())
+        unknowns = _POSE_NUMBERS * int(used.sum()) + int(free.sum())
         if measured <= unknowns:
             raise DegenerateCaptures(f"intrinsics: {measured} coordinates of corners for {unknowns} unknowns")
         covariance = np.zeros_like(total)
         covariance[np.ix_(free, free)] = squares / (measured - unknowns) * _inverted(total[np.ix_(free, free)])
-        view_rms = np.sqrt(np.nanmean(residuals**2, axis=(1, 2), where=self.seen[..., None]))
-        return Estimate(
-            intrinsics, covariance, fixed, poses, residuals, float(np.sqrt(squares / measured)), view_rms, used
-        )
+        T_E_T = np.full((len(used), 4, 4), np.nan)
+        T_E_T[used] = transform(rotation_from_vector(poses[used, :3]), poses[used, 3:])
+        rms = float(np.sqrt(squares / measured))
+        return Estimate(intrinsics, covariance, fixed, T_E_T, residuals, rms, view_rms, used)
 
 
-def _pose(points: Array, pixels: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
-    _, rotation, translation = cv2.solvePnP(
-        points, pixels, intrinsics.matrix, intrinsics.distortion, flags=cv2.SOLVEPNP_IPPE
-    )
-    return np.asarray(rotation), np.asarray(translation)
+_POSE_NUMBERS = 6
+_TURNED = 0.9
+"""Of its squares, that a view must come to by leaning the other way."""
+
+
+def _residuals(view: SeenCorners, pose: Array, camera: Array) -> Array:
+    """(n, 2) px, seen less explained."""
+    return np.asarray(view.pixels - project_with_jacobian(view.points, pose, camera)[0])
+
+
+def _pose_of(T_E_T: Array) -> Array:
+    """(6,) rotation vector and translation."""
+    return np.concatenate([vector_from_rotation(T_E_T[:3, :3]), T_E_T[:3, 3]])
 
 
 def _inverted(total: Array) -> Array:

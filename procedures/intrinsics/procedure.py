@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -28,7 +29,7 @@ from procedures.detection.outcome import corners_from_record, corners_to_record
 from procedures.events import counted
 from procedures.going import go, here
 from procedures.intrinsics.coverage import Coverage
-from procedures.intrinsics.estimate import LEAST_VIEWS, Estimate, estimate
+from procedures.intrinsics.estimate import LEAST_VIEWS, Estimate, estimate, parameters
 from procedures.intrinsics.views import Shown, ViewPlanner
 from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel, Posture
@@ -170,6 +171,7 @@ class IntrinsicsProcedure(Calibration):
         super().__init__(cell, model)
         self._camera_known = self._views_confirmed = False
         self._corners: list[Array] = []
+        self._planned = 0
 
     def steps(self) -> Procedure[None]:
         """First look, rounds of views, home."""
@@ -180,23 +182,29 @@ class IntrinsicsProcedure(Calibration):
         else:
             key = StepKey(PHASE, None, None, "stand-off")
             at = (yield from task(key, self._stand_off, self._stand_off_from)).posture
-        taken, planned = 0, 0
         for number in range(len(ROUNDS) + EXTRA_ROUNDS):
-            count = ROUNDS[number] if number < len(ROUNDS) else EXTRA_VIEWS
             if number >= len(ROUNDS) and not self._is_poor():
                 break
-            key = StepKey(PHASE, f"views/{number}", None, "plan")
-            chosen = yield from task(key, lambda n=number, c=count: self._choose(n, c, at), self._round_from)  # type: ignore[misc]
-            planned += len(chosen.postures)
-            for i, posture in enumerate(chosen.postures):
-                name = f"views/{number}-{i:02d}"
-                key = StepKey(PHASE, f"views/{number}", i, "view")
-                record = yield from task(key, lambda p=posture, n=name, r=chosen: self._view(p, n, r), self._view_from)  # type: ignore[misc]
-                yield from tell(ViewTaken(taken, planned, record.view is not None, record.reason))
-                taken += 1
-                self._learn(record)
+            yield from self._round(number, ROUNDS[number] if number < len(ROUNDS) else EXTRA_VIEWS, at)
             yield from self._know_camera()
         yield from self._go_home()
+
+    def _round(self, number: int, count: int, at: Posture) -> Procedure[None]:
+        """Choose so many views and take them."""
+        name = f"views/{number}"
+        key = StepKey(PHASE, name, None, "plan")
+        chosen = yield from task(key, lambda: self._choose(number, count, at), self._round_from)
+        taken, self._planned = self._planned, self._planned + len(chosen.postures)
+        missed = ""
+        for i, posture in enumerate(chosen.postures):
+            key = StepKey(PHASE, name, i, "view")
+            body = partial(self._view, posture, f"{name}-{i:02d}", chosen)
+            record = yield from task(key, body, self._view_from)
+            yield from tell(ViewTaken(taken + i, self._planned, record.view is not None, record.reason))
+            self._learn(record)
+            missed = record.reason or missed
+        if not self._corners:
+            raise NoPlan(f"none of the first {counted(len(chosen.postures), 'view')} showed the target: {missed}")
 
     def _choose(self, number: int, count: int, at: Posture) -> Procedure[PostureRecords]:
         start = yield from here()
@@ -264,6 +272,8 @@ class IntrinsicsProcedure(Calibration):
             found = estimate(self._corners, self._model.board, self._model.intrinsics)
         except DegenerateCaptures:
             return  # the further rounds may yet show enough
+        if not self._tells_more(found):
+            return
         self._model = self._model.but(intrinsics=found.intrinsics)
         self._camera_known = True
         coverage = coverage_of(found, self._corners)
@@ -271,6 +281,11 @@ class IntrinsicsProcedure(Calibration):
         yield from tell(CameraRefined(used, found.intrinsics, found.sigma, found.rms, coverage.share))
         if self._procedure.first_looks:
             yield from self._refine()
+
+    def _tells_more(self, found: Estimate) -> bool:
+        """Whether the views tell of the camera more than is taken for granted of the cell file's."""
+        focal = float(np.max(found.sigma[:2] / parameters(found.intrinsics)[:2]))
+        return focal < FOCAL_ERROR / 2 and float(np.max(found.sigma[2:4])) < CENTRE_ERROR / 2
 
     def _is_poor(self) -> bool:
         if len(self._corners) < LEAST_VIEWS:

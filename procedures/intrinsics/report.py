@@ -73,7 +73,8 @@ def _outcome(result: IntrinsicsResult) -> Text:
         text.append(f"\n  {reason}")
     for name, used, rms in zip(result.names, result.estimate.used, result.estimate.view_rms, strict=True):
         if not used:
-            text.append(f"\n  left out {name}: {rms:.2f} px rms")
+            why = f"{rms:.2f} px rms" if np.isfinite(rms) else "too few corners"
+            text.append(f"\n  left out {name}: {why}")
     return text
 
 

@@ -23,7 +23,7 @@ from dualcal_hal.kinematics import random_joints
 from dualcal_hal.target import Charuco
 from dualcal_hal.transforms import Array, Mask, inverse, rotation_from_vector, smallest_rotation, transform
 from procedures.intrinsics.coverage import GRID, corners_in_cells
-from procedures.intrinsics.estimate import LEAST_CORNERS, information
+from procedures.intrinsics.estimate import LEAST_CORNERS, information_of
 from procedures.planning.advice import counted
 from procedures.planning.belief import Belief
 from procedures.planning.model import CellModel, Posture
@@ -88,7 +88,7 @@ class Shown:
         for pixels, T_E_T in zip(corners, poses, strict=True):
             seen = np.isfinite(pixels[:, 0])
             if seen.sum() >= LEAST_CORNERS:
-                says = information(T_E_T, points[seen], intrinsics) / CORNER_SIGMA**2
+                says = information_of(T_E_T, points[seen], intrinsics) / CORNER_SIGMA**2
                 shown = shown.with_view(says, corners_in_cells(pixels, intrinsics.size) > 0)
         return shown
 
@@ -181,7 +181,7 @@ class ViewPlanner:
         model = self._model
         T_E_T = inverse(model.camera_in_passive(rest, self._belief)) @ model.target_in_passive(q_p)
         points = model.board.corners[np.isfinite(corners[:, 0])]
-        says = information(T_E_T, points, model.intrinsics) / CORNER_SIGMA**2
+        says = information_of(T_E_T, points, model.intrinsics) / CORNER_SIGMA**2
         cells = corners_in_cells(corners, model.intrinsics.size) > 0
         return _Candidate(Posture.of(rest, q_p), place, says, cells)
 

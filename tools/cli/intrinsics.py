@@ -1,7 +1,8 @@
-"""``dualcal run --procedure intrinsics`` and ``dualcal intrinsics import``."""
+"""``dualcal run --procedure intrinsics``, its replay, and ``dualcal intrinsics import``."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,14 +16,14 @@ from dualcal_hal.cellfile import CellFile, load_cell, standing_alone
 from dualcal_hal.clock import utc_now
 from dualcal_hal.errors import FormatError, Problem, UsageError
 from dualcal_hal.session.captures import CellShape
-from dualcal_hal.session.conduct import INTRINSICS, Conduct, keep_conduct
+from dualcal_hal.session.conduct import INTRINSICS, Conduct, keep_conduct, read_conduct
 from dualcal_hal.session.files import document_bytes
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.lock import SessionLock
 from procedures.intrinsics import IntrinsicsProcedure, IntrinsicsResult, intrinsics_result, views_of
 from procedures.intrinsics.camera_files import read_camera_file
 from procedures.intrinsics.report import draw_intrinsics, intrinsics_tables
-from procedures.intrinsics.result import findings, patch, set_options, write_patch
+from procedures.intrinsics.result import INTRINSICS_FORMAT, findings, patch, set_options, write_patch
 from procedures.planning.model import CellModel
 from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.operator import Operator
@@ -170,6 +171,35 @@ def _report(run: _Run, session: Session, result: IntrinsicsResult) -> int:
 
 def _tell_of_patch(say: Say, path: Path, intrinsics: Intrinsics) -> None:
     say(f"for the cell file: {path}, or for one run: {set_options(intrinsics)}")
+
+
+# -- replay ------------------------------------------------------------------------------------------------------------
+
+
+def replay_intrinsics(recorded: Session, file: CellFile, session: Session, *, as_json: bool) -> int:
+    """Run the procedure again on what ``recorded`` has into ``session``, and compare; 0 if it came to the same.
+
+    file: the cell with its devices played back. UsageError for a run that came to no result.
+    """
+    console = Screen(stderr=as_json)
+    if not (recorded.folder / RESULT_FILE).exists():
+        raise UsageError(f"{recorded.folder}: the run has no {RESULT_FILE} yet, with which a replay could be compared")
+    expected = recorded.read_document(RESULT_FILE, INTRINSICS_FORMAT)
+    cell, procedure = Cell(file, read_conduct(recorded).pace), IntrinsicsProcedure(file.cell, CellModel(file.cell))
+    with signals_deferred() as signals:
+        execute(cell, procedure, session, lambda event: None, lambda engine: signals.pass_on_to(engine.abort))
+    # Read as the recorded one is: what is compared is what the files say.
+    found = json.loads(document_bytes(conclude(file, session).to_document()))
+    differences = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
+    # A replay reaches its devices through another backend, and begins when it begins.
+    differences = [name for name in differences if name not in ("cell_sha256", "started")]
+    if as_json:
+        typer.echo(json.dumps({"identical": not differences, "differences": differences, "result": found}, indent=1))
+    elif differences:
+        say_line(console, f"The replay came to something else than the recorded run: {', '.join(differences)}")
+    else:
+        say_line(console, "The result is the same to the last bit.")
+    return FAULT if differences else 0
 
 
 # -- import ------------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Column
 
 from procedures.events import BeliefRefined, LookTaken, PlanReady, PointDone, counted
+from procedures.intrinsics.procedure import ViewTaken
 
 
 class Lines:
@@ -83,6 +84,8 @@ class Bars:
                 where = f"{event.constraint} position {event.position + 1}/{event.positions}"
                 text = f"{where}: {event.outcome}, {counted(event.frames, 'picture')}{offset}"
                 self._advance(event.use, 0, text, by=1 if event.captured else 0)
+            case ViewTaken():
+                self._advance("views", event.count, "found" if event.found else event.reason)
             case BeliefRefined():
                 pass  # on a terminal the bars say enough
             case _:
@@ -94,7 +97,7 @@ class Bars:
         return self._tasks[name]
 
     def _advance(self, name: str, total: int, latest: str, by: int = 1) -> None:
-        self._bars.update(self._task(name, total), advance=by, latest=latest)
+        self._bars.update(self._task(name, total), total=total or None, advance=by, latest=latest)
 
 
 def progress(console: Console) -> Lines | Bars:

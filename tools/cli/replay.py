@@ -27,7 +27,7 @@ from dualcal_hal.errors import (
     UsageError,
 )
 from dualcal_hal.session.comparison import Comparison, compare_captures, compare_results
-from dualcal_hal.session.conduct import read_conduct
+from dualcal_hal.session.conduct import INTRINSICS, read_conduct
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.journal import Journal, StepKey
 from dualcal_hal.session.log import LogReader
@@ -37,6 +37,7 @@ from dualcal_hal.session.result import Result, read_result
 from procedures.calibrate import Calibration, captures_of
 from procedures.planning.model import CellModel
 from tools.cli.exits import FAULT, signals_deferred
+from tools.cli.intrinsics import replay_intrinsics
 from tools.cli.run import analyse_session, execute, write_session_captures
 from tools.cli.terminal import Screen
 from tools.cli.truth import simulated_truth
@@ -86,7 +87,10 @@ def replay_session(options: ReplayOptions) -> int:
     """Play a session back and compare; 0 if it came to the same."""
     file = _load(options.session)
     console = Screen(stderr=options.json)
+    recorded = Session(options.session)
     with _session(options.out, file.text) as session:
+        if read_conduct(recorded).procedure == INTRINSICS:
+            return replay_intrinsics(recorded, file, session, as_json=options.json)
         replayed = _replay(options.session, file, session)
     if options.json:
         typer.echo(json.dumps(_document(replayed), indent=1, allow_nan=False))

@@ -6,9 +6,12 @@ import dataclasses
 import inspect
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,14 +25,36 @@ from dualcal_hal.errors import (
     UnknownDevice,
 )
 from dualcal_hal.robot import Mode, MotionState, RobotState
-from tests.contract.rigs import RIGS, Rig, recorded, replayed
+from tests.contract.rigs import FACTORY_RIGS, RIGS, Rig, factory, factory_cell, recorded, replayed
+from tools.cli.emulator import emulator
+
+IN_EVERY_RUN = ("controller, rep", "controller, can")
+FACTORIES = [name if name in IN_EVERY_RUN else pytest.param(name, marks=pytest.mark.slow) for name in FACTORY_RIGS]
 
 
-@pytest.fixture(params=[*RIGS, "replay"])
-def closed_rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
+@pytest.fixture(scope="session")
+def emulators(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Mapping[str, Any]]]:
+    """Where the emulator of a rig serves it; each is started once."""
+    with ExitStack() as running:
+
+        @cache
+        def start(rig: str) -> Mapping[str, Any]:
+            path = tmp_path_factory.mktemp("emulated") / "cell.yaml"
+            path.write_text(factory_cell(rig).text)
+            return running.enter_context(emulator(path))
+
+        yield start
+
+
+@pytest.fixture(params=[*RIGS, "replay", *FACTORIES])
+def closed_rig(
+    request: pytest.FixtureRequest, tmp_path: Path, emulators: Callable[[str], Mapping[str, Any]]
+) -> Iterator[Rig]:
     if request.param == "replay":
         record(request, tmp_path)
         rig = replayed(tmp_path)
+    elif request.param in FACTORY_RIGS:
+        rig = factory(request.param, emulators(request.param))
     else:
         rig = RIGS[request.param]()
     yield rig
@@ -209,12 +234,17 @@ def test_paths_that_cannot_be_followed_are_refused_and_the_arm_stays(rig: Rig) -
 
 
 def test_a_disabled_arm_refuses_to_move_until_it_is_enabled(rig: Rig) -> None:
+    if not rig.switches:
+        for switch in (rig.robot.disable, rig.robot.enable, rig.robot.reset_fault):
+            with pytest.raises(CommandRefused, match="at the pendant"):
+                switch(rig.timeout)
+        return
     rig.robot.disable(rig.timeout)
     assert rig.robot.read(rig.timeout).mode is not Mode.READY
     with pytest.raises(CommandRefused):
         rig.robot.start(rig.path(0.1))
-    rig.robot.enable(rig.timeout)
     rig.robot.reset_fault(rig.timeout)
+    rig.robot.enable(rig.timeout)
     rig.robot.start(rig.path(0.1)).wait(rig.timeout)
 
 

@@ -134,7 +134,7 @@ class Servo:
         before, q, v = self._past[-1]
         now = before + TICK
         sought, sought_velocity, rests = self._told_at(now - DELAY)
-        off = sought - q
+        off = sought - (q + TICK * v)
         # No faster than it can still brake before it is there.
         approach = np.minimum(_POSITION_GAIN * np.abs(off), np.sqrt(2.0 * self._brake * np.abs(off)))
         wanted = _within(sought_velocity + np.sign(off) * approach, self._speed)

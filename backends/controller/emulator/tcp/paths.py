@@ -177,6 +177,7 @@ class RunOn:
         self._speed, self._acceleration = speed, acceleration
         self._chain_start = np.array(start, dtype=float)
         self._peak = self._gain = 1.0
+        self._planned = 0.0, 0.0  # when the present stretch was, and how much of it lay ahead, rad
 
     @property
     def end(self) -> float:
@@ -209,6 +210,7 @@ class RunOn:
     def _go(self, here: Array, speed: float, goal: Array, begin: float) -> None:
         way = goal - here
         length = float(np.linalg.norm(way))
+        self._planned = begin, length
         if length < _NO_WAY:
             self._pieces.last = goal
             return
@@ -231,6 +233,9 @@ class RunOn:
 
     def _last_lasts(self, way: float) -> float:
         """Seconds that the last ``way`` of the present stretch takes."""
+        begin, length = self._planned
+        if way >= length:
+            return self.end - begin
         braking = self._peak**2 / (2 * self._gain)
         if way <= braking:
             return math.sqrt(2 * way / self._gain)

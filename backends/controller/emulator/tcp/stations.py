@@ -168,8 +168,11 @@ class SimpleMessageServers:
             self.soon(partial(station.controller.fail, CONTACT))
 
     def soon(self, function: Callable[[], None]) -> None:
-        """Run ``function`` on the servers' thread."""
-        self._loop.call_soon_threadsafe(function)
+        """Run ``function`` on the servers' thread, at once if this is it."""
+        if threading.current_thread() is self._thread:
+            function()
+        else:
+            self._loop.call_soon_threadsafe(function)
 
     def close(self) -> None:
         """Put all clients out; once."""

@@ -344,6 +344,15 @@ def test_a_drive_stops_and_has_a_fault_when_the_masters_heartbeat_is_lost(rig: R
     assert rig.sync() == {}  # it has gone to pre-operational, as 1029 has it
 
 
+def test_a_drive_whose_master_has_gone_goes_no_farther_than_its_last_target(rig: Rig) -> None:
+    watching(rig)
+    beat(rig, 0.1)
+    for target in (20, 40, 60):
+        rig.cycle(0x0F, target)
+    rig.pass_time(1.0)
+    assert (rig.shown().state, rig.shown().position) == ("fault", 60)
+
+
 def test_it_is_watched_from_the_first_one_on(rig: Rig) -> None:
     watching(rig)
     rig.pass_time(1.0)

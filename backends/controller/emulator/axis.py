@@ -114,6 +114,11 @@ class Axis:
         """Whether its set points come by SYNC and nothing else moves it."""
         return self.state is State.ENABLED and self.mode == CYCLIC_SYNCHRONOUS_POSITION
 
+    @property
+    def period(self) -> float:
+        """Seconds from one set point of a cyclic mode to the next, as it was told."""
+        return float(self._values[0x60C2, 1] * 10.0 ** self._values[0x60C2, 2])
+
     # What a master reads
 
     def statusword(self) -> int:
@@ -194,6 +199,8 @@ class Axis:
         if self.state is State.ENABLED:
             if self.mode == PROFILE_POSITION:
                 self._go_on_with_profile(dt)
+            elif now - self._synced > 2 * self.period:  # it has come to rest at its last set point
+                self._generator.rest(self._generator.position)
         elif self.state is State.FAULT_REACTION:
             if self._brake(0x6085, dt):
                 self._switch_off(State.FAULT)

@@ -78,11 +78,6 @@ class Drive:
         network.add_node(self.node)
         self._boot()
 
-    @property
-    def period(self) -> float:
-        """Seconds from one set point of a cyclic mode to the next, as it was told."""
-        return float(self._values[0x60C2, 1] * 10.0 ** self._values[0x60C2, 2])
-
     # What comes by the bus
 
     def on_nmt(self, command: int, now: float) -> None:

@@ -154,7 +154,7 @@ class ArmDrives:
                         self.bus.send(pdo.cob_id, data)
         for drive in self.drives:
             drive.on_sync(now)
-        self._command(next((drive.period for drive in self.drives if drive.axis.is_cyclic), TICK))
+        self._command(next((axis.period for axis in self._axes if axis.is_cyclic), TICK))
 
     def _on_nmt(self, data: bytes) -> None:
         if len(data) >= 2:
@@ -190,10 +190,10 @@ class ArmDrives:
         )
         return [
             {
-                0x6065: int(_FOLLOWING_TIME * v * counts),
+                0x6065: min(int(_FOLLOWING_TIME * v * counts), 0xFFFFFFFE),
                 0x6067: int(_POSITION_WINDOW * counts) + 1,
-                0x6081: int(v * counts) + 1,
-                **dict.fromkeys((0x6083, 0x6084, 0x6085), int(a * counts) + 1),
+                0x6081: min(int(v * counts) + 1, 0xFFFFFFFF),
+                **dict.fromkeys((0x6083, 0x6084, 0x6085), min(int(a * counts) + 1, 0xFFFFFFFF)),
             }
             for counts, v, a in zip(np.abs(self._counts_per_rad), speed, acceleration, strict=True)
         ]

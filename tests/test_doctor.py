@@ -14,7 +14,7 @@ from backends.simulator.robot import SimulatedRobot
 from dualcal_hal.cellfile import load_cell
 from dualcal_hal.commissioning import Commissioning
 from dualcal_hal.errors import LinkLost
-from dualcal_hal.robot import JointPath, Mode, Robot, RobotState
+from dualcal_hal.robot import JointPath, Mode, Robot, RobotState, StopResult
 from tests.cells import TINY
 from tests.command_line import dualcal
 
@@ -481,3 +481,35 @@ def test_an_arm_that_is_not_ready_is_not_moved_unless_it_is_to_be_enabled(real, 
     result = wiggle(real, "y\n", "--arm", "right", "--enable")
     assert result.exit_code == 0, result.output
     assert "right: its drives were switched on" in result.output
+
+
+class Interrupting:
+    """Signals of which one comes as soon as anybody asks."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        return None
+
+    def pass_on_to(self, abort):
+        abort("interrupted by SIGINT")
+
+
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_an_interrupt_stops_the_arm_on_its_way_and_nothing_is_recorded(real, monkeypatch, confirmed):
+    stopped = []
+    original = SimulatedRobot.stop
+
+    def stop(self, reason):
+        stopped.append((self.name, reason))
+        original(self, reason)
+        return StopResult(confirmed, "no newer state came")
+
+    monkeypatch.setattr(SimulatedRobot, "stop", stop)
+    monkeypatch.setattr("tools.cli.wiggle.signals_deferred", Interrupting)
+    result = wiggle(real, "y\n" * 10)
+    assert result.exit_code != 0
+    assert stopped[0] == ("left", "interrupted by SIGINT")
+    assert ("use the emergency stop" in result.stderr) == (not confirmed)
+    assert not record(real).path.exists()

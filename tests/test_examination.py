@@ -72,8 +72,8 @@ def found(robot):
 def test_an_arm_in_order_is_good_in_every_line(robot):
     lines = found(robot)
     assert {each.verdict for each in lines.values()} == {"good"}
-    assert lines["states"].said == "250.0 Hz, jitter 0.0 ms, longest gap 4 ms"
-    assert lines["e-stop"].said == "not pressed"
+    assert lines["state rate"].said == "250.0 Hz, jitter 0.0 ms, longest gap 4 ms"
+    assert lines["emergency stop"].said == "not pressed"
     assert lines["joints"].said.startswith("0.0 0.0 60.0 0.0 30.0 0.0 deg")
 
 
@@ -97,9 +97,9 @@ def test_each_mode_but_ready_is_told_with_what_to_do(robot, mode, verdict, words
 
 def test_an_emergency_stop_has_a_line_of_its_own(robot):
     robot.mode = Mode.EMERGENCY_STOP
-    assert (found(robot)["e-stop"].said, found(robot)["e-stop"].verdict) == ("pressed", "problem")
+    assert (found(robot)["emergency stop"].said, found(robot)["emergency stop"].verdict) == ("pressed", "problem")
     robot.mode = Mode.UNKNOWN
-    assert found(robot)["e-stop"].said == "not known"
+    assert found(robot)["emergency stop"].said == "not known"
 
 
 def test_faults_are_told_as_the_device_has_them(robot):
@@ -132,7 +132,7 @@ def test_an_arm_that_moves_is_noted(robot):
 
 def test_jitter_is_told_and_a_gap_that_would_stop_a_motion_is_a_problem(robot):
     robot.times = np.concatenate([np.arange(0, 1, 0.01), np.arange(1.15, 1.9, 0.01)])
-    line = found(robot)["states"]
+    line = found(robot)["state rate"]
     assert line.verdict == "problem"
     assert "longest gap 160 ms" in line.said
     assert "after 100 ms" in line.advice
@@ -140,12 +140,14 @@ def test_jitter_is_told_and_a_gap_that_would_stop_a_motion_is_a_problem(robot):
 
 def test_a_controller_that_reports_at_10_hz_may_take_three_periods(robot):
     robot.times = np.array([0.0, 0.1, 0.2, 0.3, 0.55, 0.65, 0.75, 0.85, 0.95])
-    assert found(robot)["states"].verdict == "good"
+    assert found(robot)["state rate"].verdict == "good"
 
 
 def test_an_arm_that_reports_nothing_by_itself_is_a_problem(robot):
     robot.times = np.array([])
-    assert found(robot)["states"] == Finding("states", "0 in 2 s", "problem", "check the link and its state port")
+    assert found(robot)["state rate"] == Finding(
+        "state rate", "0 in 2 s", "problem", "check the link and its state port"
+    )
 
 
 def test_failures_that_are_told_meanwhile_are_problems(robot):
@@ -162,10 +164,10 @@ def test_states_of_another_clock_are_a_problem(robot, age, words):
 
 
 def test_what_the_device_says_of_itself_is_told_and_not_twice(robot):
-    robot.said = [Finding("byte order", "big endian, f32"), Finding("states", "told by the link")]
+    robot.said = [Finding("byte order", "big endian, f32"), Finding("state rate", "told by the link")]
     lines = list(examine_robot(robot, CONFIG, robot.clock))
     assert lines[1] == robot.said[0]
-    assert [each.said for each in lines if each.subject == "states"] == ["told by the link"]
+    assert [each.said for each in lines if each.subject == "state rate"] == ["told by the link"]
     robot.times = np.array([])
     assert "0 in 2 s" in [each.said for each in examine_robot(robot, CONFIG, robot.clock)][-1]
 
@@ -221,7 +223,7 @@ def test_a_camera_in_order_that_sees_the_target_is_good_in_every_line():
     assert {each.verdict for each in lines.values()} == {"good"}
     assert "9 of 9 corners" in lines["target"].said
     assert lines["frame size"].said == "512 x 384 px, as the intrinsics'"
-    assert "20.0 frames a second on demand" in lines["rate"].said
+    assert "20.0 frames a second on demand" in lines["frames"].said
 
 
 def test_frames_of_another_size_than_the_intrinsics_are_a_problem_and_no_target_is_looked_for():
@@ -264,5 +266,5 @@ def test_a_camera_that_falls_silent_is_a_problem_and_its_last_frame_is_looked_at
     camera = Shown(board())
     camera.lost_after = 3
     lines = seen(camera)
-    assert lines["rate"] == Finding("rate", "after 3 frames: no frame came", "problem", "check its cable")
+    assert lines["frames"] == Finding("frames", "after 3 frames: no frame came", "problem", "check its cable")
     assert "9 of 9" in lines["target"].said

@@ -53,10 +53,19 @@ def examine_camera(camera: Camera, cell: CellConfig, clock: Clock) -> list[Findi
     return _told_once(_camera(camera, cell, clock))
 
 
+_SEVERITY = {"good": 0, "note": 1, "problem": 2}
+
+
 def _told_once(findings: Iterator[Finding]) -> list[Finding]:
-    """Without what is good and was told before, by the device itself, which knows more."""
-    told: dict[str, Finding] = {}
-    return [each for each in findings if each.verdict != "good" or told.setdefault(each.subject, each) is each]
+    """Without what was told before, by the device itself, which knows more; unless it is worse than that."""
+    told: dict[str, int] = {}
+    kept = []
+    for each in findings:
+        severity = _SEVERITY[each.verdict]
+        if severity > told.get(each.subject, -1):
+            kept.append(each)
+            told[each.subject] = severity
+    return kept
 
 
 def _robot(robot: Robot, config: RobotConfig, clock: Clock) -> Iterator[Finding]:
@@ -86,11 +95,11 @@ def _own_findings(findings: Callable[[], list[Finding]]) -> Iterator[Finding]:
 def _condition(state: RobotState) -> Iterator[Finding]:
     yield _MODES[state.mode]
     if state.mode is Mode.EMERGENCY_STOP:
-        yield Finding("e-stop", "pressed", "problem", "release it at the controller")
+        yield Finding("emergency stop", "pressed", "problem", "release it at the controller")
     elif state.mode is Mode.UNKNOWN:
-        yield Finding("e-stop", "not known", "note")
+        yield Finding("emergency stop", "not known", "note")
     else:
-        yield Finding("e-stop", "not pressed")
+        yield Finding("emergency stop", "not pressed")
     if state.faults:
         yield Finding("faults", "; ".join(state.faults), "problem", "clear them; then: dualcal reset")
     else:
@@ -155,7 +164,9 @@ def _states(robot: Robot, clock: Clock) -> Iterator[Finding]:
 
 def _rate(times: list[float], sequences: list[int]) -> Finding:
     if len(times) < 2:
-        return Finding("states", f"{len(times)} in {WATCHED_FOR:g} s", "problem", "check the link and its state port")
+        return Finding(
+            "state rate", f"{len(times)} in {WATCHED_FOR:g} s", "problem", "check the link and its state port"
+        )
     gaps = np.diff(times)
     usual, longest = float(np.median(gaps)), float(np.max(gaps))
     jitter = float(np.percentile(np.abs(gaps - usual), 95))
@@ -166,8 +177,8 @@ def _rate(times: list[float], sequences: list[int]) -> Finding:
     late = max(OLDEST_FEEDBACK, _LATE_PERIODS * usual)
     if longest > late:
         advice = f"a motion is stopped after {1e3 * late:.0f} ms: check cables, switches and this computer's load"
-        return Finding("states", said, "problem", advice)
-    return Finding("states", said)
+        return Finding("state rate", said, "problem", advice)
+    return Finding("state rate", said)
 
 
 # Cameras
@@ -195,7 +206,7 @@ def _camera(camera: Camera, cell: CellConfig, clock: Clock) -> Iterator[Finding]
             grabbed.append(_grab(camera, clock))
         yield _frame_rate(grabbed)
     except DeviceError as error:
-        yield Finding("rate", f"after {len(grabbed)} frames: {error.why}", "problem", error.advice)
+        yield Finding("frames", f"after {len(grabbed)} frames: {error.why}", "problem", error.advice)
     latest = grabbed[-1]
     yield _exposed(latest)
     yield from _image(latest.frame, cell)
@@ -211,8 +222,8 @@ def _frame_rate(grabbed: list[_Grabbed]) -> Finding:
     needed = [each.handed_over - each.asked for each in grabbed]
     mean, longest = float(np.mean(needed)), float(np.max(needed))
     if mean <= 0.0:  # in a time that is made by waiting
-        return Finding("rate", f"{len(grabbed)} frames as soon as they were asked for")
-    return Finding("rate", f"{1 / mean:.1f} frames a second on demand, the slowest after {1e3 * longest:.0f} ms")
+        return Finding("frames", f"{len(grabbed)} frames as soon as they were asked for")
+    return Finding("frames", f"{1 / mean:.1f} frames a second on demand, the slowest after {1e3 * longest:.0f} ms")
 
 
 def _exposed(grabbed: _Grabbed) -> Finding:

@@ -10,6 +10,7 @@ import numpy as np
 
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import Array, inverse, vector_from_rotation
+from procedures.commissioning.causes import joints_in_words
 from procedures.estimation.projection import project
 from procedures.planning.model import CellModel
 
@@ -148,8 +149,8 @@ def judge(motion: Array, expected: Mapping[int, Array], joint: int) -> Seen:
     if (joint, 1) in fitting:
         if len(fitting) == 1:
             return Seen(Outcome.PROVEN, f"the camera saw it, within {100 * misfits[joint, 1]:.0f} % of its motion")
-        rivals = ", ".join(str(other + 1) for other, _ in fitting if other != joint)
-        return Seen(Outcome.OPEN, f"in this posture the camera cannot tell it from joint {rivals}")
+        rivals = joints_in_words(sorted({other for other, _ in fitting if other != joint}))
+        return Seen(Outcome.OPEN, f"in this posture the camera cannot tell it from {rivals}")
     if misfits[joint, 1] < _DIFFERS or not fitting:
         return Seen(Outcome.OPEN, "what the camera saw is no single joint's motion by the nominal hand-eye transform")
     other, sign = min(fitting, key=lambda each: misfits[each])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -250,8 +250,7 @@ def _document(check: FlangeCheck) -> dict[str, Any]:
 
 
 def _cause_document(cause: Cause) -> dict[str, Any]:
-    record = asdict(cause)
-    return {key: record[key] for key in ("kind", "what", "advice", "joints")}
+    return {"kind": cause.kind, "what": cause.what, "advice": cause.advice, "joints": list(cause.joints)}
 
 
 def _say(console: Console, line: str) -> None:

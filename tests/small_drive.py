@@ -30,6 +30,7 @@ class SmallDrive:
     dead: bool = False
     aborts: set[int] = field(default_factory=set)
     window: int = 2000
+    voltage: bool = True
     stiff: bool = False
     # What it is.
     state: int = SWITCH_ON_DISABLED
@@ -69,7 +70,7 @@ class SmallDrive:
 
     def statusword(self) -> int:
         arrived = self.set_point is None or self.position == self.set_point
-        return self.state | 0x10 | (0x400 if arrived else 0) | (0x1000 if self.taken else 0)
+        return self.state | 0x10 * self.voltage | (0x400 if arrived else 0) | (0x1000 if self.taken else 0)
 
     def control(self, word: int) -> None:
         before = self.controlwords[-1] if self.controlwords else 0

@@ -56,8 +56,12 @@ class Axis:
     @property
     def condition(self) -> str:
         """Its state in words, and why it may be in it."""
-        off = self.state is State.SWITCH_ON_DISABLED and not self.statusword & VOLTAGE
-        return f"{self.state}, without voltage for the motor (emergency stop?)" if off else str(self.state)
+        return str(self.state) if self.has_voltage else f"{self.state}, without voltage for the motor (emergency stop?)"
+
+    @property
+    def has_voltage(self) -> bool:
+        """Whether the motor could get any current; a drive in operation has it, whatever it says."""
+        return bool(self.statusword & VOLTAGE) or self.state is State.OPERATION_ENABLED
 
     @property
     def position(self) -> int:

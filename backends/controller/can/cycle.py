@@ -267,7 +267,7 @@ class Cycle:
             for axis in self.axes:
                 axis.bits = HALT if self._halted else 0
         else:
-            if late >= STOP_AT and self._transfer is not None:
+            if late >= STOP_AT and not lead.is_braking:
                 self._fail(self._why_late(late))
             try:
                 lead.command(self.axes, late)
@@ -288,8 +288,9 @@ class Cycle:
     # What the drives said. All with the lock held.
 
     def _judge(self) -> None:
-        for watch in self._watch:
-            self._judge_drive(watch)
+        left = [watch.axis for watch in self._watch if self._judge_drive(watch)]
+        if left:
+            self._fail_left(left)
         self._judge_silence([w for w in self._watch if w.silent == self._late_feedback], "has not answered")
         heartless = [w for w in self._watch if w.heartless == self._late_heartbeat and w.silent < self._late_feedback]
         self._judge_silence(heartless, "has sent no heartbeat")
@@ -305,7 +306,8 @@ class Cycle:
                     )
                 )
 
-    def _judge_drive(self, watch: _Watch) -> None:
+    def _judge_drive(self, watch: _Watch) -> bool:
+        """Whether it has left operation enabled, other than by a fault, which is told here."""
         axis = watch.axis
         while axis.emergencies:
             emergency = axis.emergencies.popleft()
@@ -327,7 +329,15 @@ class Cycle:
                 self._fail_drive(axis, f"is in {axis.state}{hint}; it told no code")
         elif self._enabled and led and axis.state is not State.OPERATION_ENABLED:
             axis.goal = Goal.OFF  # it is enabled again by the operator alone
-            self._fail_drive(axis, f"has left operation enabled by itself, is {axis.condition} now")
+            return True
+        return False
+
+    def _fail_left(self, axes: list[Axis]) -> None:
+        names = ", ".join(f"{axis.name} is {axis.state}" for axis in axes)
+        power = "; there is no voltage for the motors: emergency stop?" if not any(a.has_voltage for a in axes) else ""
+        advice = f"see why, then enable arm {self._device}"
+        why = f"operation enabled was left, unasked: {names}{power}"
+        self._fail(DeviceError(self._device, "watch the drives", why, advice))
 
     def _judge_silence(self, watches: list[_Watch], what: str) -> None:
         if watches:
@@ -398,6 +408,8 @@ class Cycle:
     def _mode(self, faults: tuple[str, ...]) -> Mode:
         if faults:
             return Mode.FAULT
+        if not any(axis.has_voltage for axis in self.axes):
+            return Mode.EMERGENCY_STOP
         ready = all(
             axis.goal is Goal.ON
             and axis.state is State.OPERATION_ENABLED

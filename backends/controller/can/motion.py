@@ -32,6 +32,8 @@ class Lead(ABC):
     """Whether all of it was told to the drives."""
     is_over: bool = False
     """Whether nothing more is to come: told, or at rest after a brake."""
+    is_braking: bool = False
+    """Whether it is to end before its end."""
     halted: bool = False
     """Whether the drives are left with the halt bit set."""
     largest_step: float = 0.0
@@ -60,7 +62,6 @@ class CourseLead(Lead):
         self._last = np.array(held)
         self._time = 0.0
         self._pace = 1.0
-        self._braking = False
 
     def command(self, axes: Sequence[Axis], late: int) -> None:
         target = self.next(late)
@@ -71,11 +72,11 @@ class CourseLead(Lead):
         """The target (n,), rad, of the next cycle. ValueError for a course that does not keep its own speed."""
         if late >= STOP_AT:
             self.brake()
-        if self.is_over or (late == HOLD_AT and not self._braking):
+        if self.is_over or (late == HOLD_AT and not self.is_braking):
             return self._last
         if late == SLOW_AT:
             self._pace *= 0.5
-        elif not self._braking:
+        elif not self.is_braking:
             self._pace = min(1.0, self._pace + _RECOVERY)
         if (leading := self._towards_start()) is not None:
             return self._step_to(leading)
@@ -85,9 +86,9 @@ class CourseLead(Lead):
         return target
 
     def brake(self) -> None:
-        if self._braking:
+        if self.is_braking:
             return
-        self._braking = True
+        self.is_braking = True
         if self._time > 0.0:
             self._course.brake(self._time)
             self._pace = max(self._pace, 0.5)  # else a course slowed down would also take long to end
@@ -113,7 +114,7 @@ class CourseLead(Lead):
     def _look_for_end(self) -> None:
         if self._time >= self._course.duration:
             self.is_over = True
-            self.is_told = not self._braking
+            self.is_told = not self.is_braking
 
 
 class _Handshake(Enum):
@@ -140,7 +141,6 @@ class SetPointLead(Lead):
         self._arrival = arrival
         self._handshake = _Handshake.WAITING
         self._targets: Sequence[int] = ()
-        self._braking = False
         self._last_one = False
         self._lock = threading.Lock()
         self.wake: threading.Event = threading.Event()
@@ -155,7 +155,7 @@ class SetPointLead(Lead):
 
     def brake(self) -> None:
         with self._lock:
-            self._braking = self.halted = True
+            self.is_braking = self.halted = True
             self.is_over = True
         self.wake.set()
 
@@ -163,10 +163,10 @@ class SetPointLead(Lead):
         if late >= STOP_AT:
             self.brake()
         with self._lock:
-            if not self._braking:
+            if not self.is_braking:
                 self._proceed(axes)
             bits = HALT if self.halted else 0
-            if self._handshake is _Handshake.PRESENTED and not self._braking:
+            if self._handshake is _Handshake.PRESENTED and not self.is_braking:
                 bits |= NEW_SET_POINT | AT_ONCE
         for number, axis in enumerate(axes):
             axis.bits = bits

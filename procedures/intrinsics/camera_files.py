@@ -21,7 +21,7 @@ from dualcal_hal.errors import FormatError, Problem
 from dualcal_hal.session.plain import expect, finites
 from dualcal_hal.transforms import Array
 
-LARGEST_FILE = 1_000_000
+LARGEST_FILE = 500_000
 """Bytes; a camera takes a few hundred."""
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")

@@ -21,9 +21,9 @@ from procedures.intrinsics.procedure import SeenView, coverage_of
 
 INTRINSICS_FORMAT = "dualcal.intrinsics/1"
 
-WORST_NOISE = 10.0
+WORST_NOISE = 5.0
 """An rms above so many times camera.sigma_px is none of corners' noise ..."""
-WORST_RMS = 0.3
+WORST_RMS = 0.1
 """... if it is above this, px per axis."""
 WORST_FOCAL = 0.01
 """Sigma of a focal length, in parts of it, above which it is not known."""
@@ -109,8 +109,9 @@ def _doubts(found: Estimate, camera: CameraConfig) -> Iterator[str]:
     limit = max(WORST_NOISE * camera.sigma_px, WORST_RMS)
     if found.rms > limit:
         yield (
-            f"the residuals are {found.rms:.2f} px rms, far above the noise of corners (at most {limit:.2f} px): "
-            "check rows, columns and flatness of the target, the focus, and that the lens is none with a fisheye's view"
+            f"the residuals are {found.rms:.2f} px rms, far above the noise of corners (at most {limit:.2f} px by "
+            "camera.sigma_px): check the target's corners, square_mm and flatness, the focus, and that the lens is no "
+            "fisheye's"
         )
     focal = parameters(found.intrinsics)[:2]
     worst = float(np.max(found.sigma[:2] / focal))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -69,11 +70,6 @@ class Feedback:
         return self._open
 
     @property
-    def latest(self) -> ArmReport | None:
-        """The newest report, however old."""
-        return self._report
-
-    @property
     def mode(self) -> Mode:
         """By the newest STATUS, if it is not too old to say."""
         return condition.mode(self._current_status(self._clock.now()), self._unknown_is_ready)
@@ -104,6 +100,11 @@ class Feedback:
         """The arm is taken to move until a STATUS that came after ``time`` says that it does not."""
         self._moves_until = time
 
+    def may_move(self) -> bool:
+        """Whether the arm may move: unless a STATUS that is new enough has said that it does not."""
+        report = self._report
+        return report is None or report.in_motion is not False or report.time <= self._moves_until
+
     def is_late(self) -> bool:
         """Whether the newest report is too old to begin a motion by."""
         report = self._report
@@ -125,9 +126,12 @@ class Feedback:
         return remove
 
     def tell(self, error: DeviceError) -> None:
-        """Tell all that watch of a failure."""
+        """Tell all that watch of a failure, whatever becomes of one of them."""
         for function in self._watchers:
-            function(named(error, self._arm))
+            try:
+                function(named(error, self._arm))
+            except Exception:
+                logging.getLogger(__name__).exception("%s: one that was told of a failure failed", self._arm)
 
     def findings(self) -> list[Finding]:
         """Its rate and condition, in an operator's words, after reports of a second."""

@@ -46,14 +46,15 @@ class HandOver:
         self._halted = threading.Event()
         self._error: DeviceError | None = None
         self._request: Request | None = None
-        self._begun = threading.Event()
+        self._accepted = False
+        self._ended_or_accepted = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"hand over to {arm}", daemon=True)
 
     def begin(self) -> None:
-        """Returns once all that is needed was taken; raises the error that it failed by."""
+        """Returns once all that is needed was taken; raises the error that it failed by before that."""
         self._thread.start()
-        self._clock.wait(self._begun, None)
-        if self.transfer.error is not None:
+        self._clock.wait(self._ended_or_accepted, None)
+        if not self._accepted and self.transfer.error is not None:
             raise self.transfer.error
 
     def halt(self, error: DeviceError) -> None:
@@ -77,9 +78,13 @@ class HandOver:
             for number, (message, packet) in enumerate(self._packets, 1):
                 self._hand(message, packet, number)
                 if number == self._needed:
-                    self._begun.set()
+                    self._accepted = True
+                    self._ended_or_accepted.set()
         except DeviceError as failed:
             error = failed
+        except Exception as failed:  # noqa: BLE001 - whoever waits for the course would wait for ever
+            error = DeviceError(self._arm, "move", f"this program failed: {failed!r}", "report it")
+            error.__cause__ = failed
         self.running = False
         if error is None:
             self.transfer.completed()
@@ -88,7 +93,7 @@ class HandOver:
                 with suppress(DeviceError):  # the failure itself is told
                     self._port.stop(self._arm, self._dialect.stop(self._group))
             self.transfer.failed(error)
-        self._begun.set()
+        self._ended_or_accepted.set()
 
     def _hand(self, message: Message, packet: bytes, number: int) -> None:
         give_up = self._clock.now() + _BUSY_FOR

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
+from typing import NoReturn
 
 from backends.controller.tcp.codec import Code, CodecError, FrameSplitter, Message, Wire, decode, encode
 from backends.controller.tcp.dialects import Dialect, ping
@@ -16,7 +17,7 @@ from dualcal_hal.errors import CommandRefused, DeviceError, DeviceTimeout, LinkL
 PING_EVERY = 1.0
 """Seconds without traffic after which a server that takes a PING is asked whether it is there."""
 
-_STOP_WAITS = 0.05  # s for the reply to what was sent before: not all controllers take two messages at once
+_STOP_WAITS = 0.02  # s for the reply to what was sent before: not all controllers take two messages at once
 _SEND_WITHIN = 0.1  # s
 _LATE = 0.5  # s after its time that a reply may still come; then nobody knows which reply is whose
 _LOOK_EVERY = 0.25  # s
@@ -64,10 +65,6 @@ class MotionPort(Port):
         self._sent: deque[Request] = deque()
         self._traffic = 0.0
         self._listeners: tuple[Callable[[DeviceError], None], ...] = ()
-
-    def open(self, deadline: float) -> None:
-        self._written = self._wire()
-        super().open(deadline)
 
     def on_failure(self, function: Callable[[DeviceError], None]) -> Callable[[], None]:
         """Tell ``function`` each time the connection breaks, or what was taken is refused afterwards, on the port's
@@ -147,6 +144,10 @@ class MotionPort(Port):
 
     # -- on the port's thread -----------------------------------------------------------------------------------
 
+    def _prepare(self) -> None:
+        # As the server writes now: it may be another than the one before.
+        self._written = self._wire() or self._written
+
     def _may_connect(self) -> bool:
         return self._wire() is not None
 
@@ -158,9 +159,8 @@ class MotionPort(Port):
         for function in self._listeners:
             function(error)
 
-    def _serve(self, connection: Connection) -> None:
-        # As the server writes now: it may be another than the one before.
-        self._written = wire = self._wire() or self._written
+    def _serve(self, connection: Connection) -> NoReturn:
+        wire = self._written
         if wire is None:
             raise self._not_connected("read")
         splitter = FrameSplitter(wire.byte_order)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from typing import NoReturn
 
 from backends.controller.tcp.transport import Address, Connection
 from dualcal_hal.clock import Clock
@@ -37,6 +38,7 @@ class Port(ABC):
         except LinkLost:
             self.close()
             raise
+        self._prepare()
         self.connected_at = self._clock.now()
         name = f"{type(self).__name__} {self.address}"
         self._thread = threading.Thread(target=self._run, args=(connection,), name=name, daemon=True)
@@ -60,12 +62,16 @@ class Port(ABC):
             self._thread = None
 
     @abstractmethod
-    def _serve(self, connection: Connection) -> None:
+    def _serve(self, connection: Connection) -> NoReturn:
         """Read from it until it breaks, which is raised as a DeviceError."""
 
     @abstractmethod
     def _lost(self, error: DeviceError) -> None:
         """The connection broke; ``error`` says how. It is closed already."""
+
+    @abstractmethod
+    def _prepare(self) -> None:
+        """A connection was made, of which nobody knows yet."""
 
     def _may_connect(self) -> bool:
         """Whether it is time to connect anew."""
@@ -74,17 +80,26 @@ class Port(ABC):
     def _run(self, connection: Connection | None) -> None:
         back_off = FIRST_BACK_OFF
         while connection is not None:
-            try:
-                self._serve(connection)
-            except DeviceError as error:
-                self.connected_at = None
-                connection.close()
-                if self._closing.is_set():
-                    return
-                self._lost(error)
+            error = self._end_of(connection)
+            self.connected_at = None
+            connection.close()
+            if self._closing.is_set():
+                return
+            self._lost(error)
             if connection.statistics.messages_in:
                 back_off = FIRST_BACK_OFF
             connection, back_off = self._reconnect(back_off)
+
+    def _end_of(self, connection: Connection) -> DeviceError:
+        """Serve a connection; why that ended."""
+        try:
+            self._serve(connection)
+        except DeviceError as error:
+            return error
+        except Exception as error:  # noqa: BLE001 - a thread that died silently would leave its arm unwatched
+            failed = LinkLost(self._arm, "read", f"this program failed: {error!r}", "report it")
+            failed.__cause__ = error
+            return failed
 
     def _reconnect(self, back_off: float) -> tuple[Connection | None, float]:
         """A new connection, None once it is closed; and how long to wait when that breaks."""
@@ -100,6 +115,7 @@ class Port(ABC):
                 connection.connect(self._clock.now() + _CONNECT_WITHIN)
             except LinkLost:
                 continue
+            self._prepare()
             self.connected_at = self._clock.now()
             return connection, back_off
         return None, back_off

@@ -200,11 +200,8 @@ class SimpleMessageArm(ArmLink):
         self._feedback.tell(error)
 
     def _moves(self) -> bool:
-        """Whether it may be on a course: not once a newer STATUS has said that it stands."""
-        if self._handover is None:
-            return False
-        report = self._feedback.latest
-        return self._handover.running or report is None or report.in_motion is not False
+        """Whether it may be on a course."""
+        return self._handover is not None and (self._handover.running or self._feedback.may_move())
 
     # -- what has to be so before -------------------------------------------------------------------------------
 
@@ -251,11 +248,9 @@ class SimpleMessageArm(ArmLink):
 
     def _await(self, attempted: str, done: Callable[[Status], bool], deadline: float) -> None:
         """Wait for a STATUS that says so."""
-        while True:
-            self._feedback.report_after(self._clock.now(), deadline)
-            status = self._feedback.status
-            if status is not None and done(status):
-                return
-            if self._clock.now() >= deadline:
-                why = "the controller took the command, and its STATUS does not show it"
-                raise DeviceTimeout(self.arm, attempted, why, "see the controller's messages")
+        try:
+            while (status := self._feedback.status) is None or not done(status):
+                self._feedback.report_after(self._clock.now(), deadline)
+        except DeviceTimeout as error:
+            why = "the controller took the command, and its STATUS does not show it"
+            raise DeviceTimeout(self.arm, attempted, why, "see the controller's messages") from error

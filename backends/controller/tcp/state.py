@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import NoReturn, Protocol
 
 from backends.controller.tcp.codec import (
     ByteOrder,
@@ -113,12 +113,15 @@ class StatePort(Port):
         super().close()
         self.wire = None
 
+    def _prepare(self) -> None:
+        self.wire = None
+
     def _lost(self, error: DeviceError) -> None:
         self.wire = None
         for listener in self._listeners:
             listener.lost(error)
 
-    def _serve(self, connection: Connection) -> None:
+    def _serve(self, connection: Connection) -> NoReturn:
         for listener in self._listeners:
             listener.connected(self._clock.now())
         try:
@@ -127,7 +130,7 @@ class StatePort(Port):
             why = f"{self.address} sent what is no message: {error}"
             raise LinkLost(self._arm, "read", why, "check port, byte order and network") from error
 
-    def _read(self, connection: Connection) -> None:
+    def _read(self, connection: Connection) -> NoReturn:
         begin = self._clock.now()
         head = b""
         while len(head) < 8:

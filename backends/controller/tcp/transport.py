@@ -90,9 +90,9 @@ class Connection:
                 made.setblocking(False)
                 made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 _watch(made)
-            except OSError as error:
+            except (OSError, UnicodeError) as error:  # the latter for what is no host's name
                 self._release()
-                why = "no answer" if isinstance(error, TimeoutError) else error.strerror or str(error)
+                why = "no answer" if isinstance(error, TimeoutError) else getattr(error, "strerror", None) or str(error)
                 raise self._lost("connect", "the connection is closed" if self._closed else why) from error
             if self._closed:  # while it was being made
                 self._release()

@@ -254,11 +254,14 @@ def test_abb_has_an_error_after_anything_but_a_point(kind: int) -> None:
         assert status[6] == 0
 
 
-def test_abb_takes_what_comes_in_one_piece_for_one_message() -> None:
+def test_abb_does_not_wait_for_the_rest_of_a_message() -> None:
     with serving("dialect: abb") as rig:
         client, home = rig.client(), rig.cell.cell.active.home
         message = client.pack("4i", 64, POINT, 2, 0) + client.point(START_DOWNLOAD, home)
         client.motion.sendall(message + message)
+        assert [client.receive()[:3] for _ in range(2)] == [(POINT, 3, 1)] * 2
+        client.motion.sendall(message[:30])
+        assert client.motion.recv(1) == b""
         assert client.status_with(lambda status: status[3] == 1)
 
 
@@ -332,6 +335,15 @@ def test_at_fanuc_a_stop_waits_behind_a_point() -> None:
         stands = rig.settled()
         assert np.max(np.abs(stands - home)) > 0.9 * np.max(np.abs(AWAY))
         assert np.max(np.abs(stands - home - 2 * AWAY)) > NEAR
+
+
+def test_fanuc_takes_one_message_after_the_other() -> None:
+    with serving("dialect: fanuc", order=">") as rig:
+        client, home = rig.client(), rig.cell.cell.active.home
+        messages = [client.pack("4i", 64, POINT, 2, 0) + client.point(n, home + n * AWAY) for n in (0, 1, STOP)]
+        client.motion.sendall(b"".join(messages))
+        numbers = [client.unpack("i", client.receive()[3][:4])[0] for _ in range(3)]
+        assert numbers == [0, 1, STOP]
 
 
 def test_fanuc_puts_its_client_out_for_a_point_that_it_cannot_reach() -> None:
@@ -465,6 +477,15 @@ def test_motoman_answers_a_ping_and_takes_its_body_for_another_message() -> None
         kind, _, _, body = client.receive()
         assert kind == ANSWER
         assert client.unpack("5i", body[:20])[3:] == (INVALID, 3003)
+
+
+def test_motoman_does_not_wait_for_the_rest_of_a_message() -> None:
+    with serving("dialect: motoman", order=">") as rig:
+        client = rig.client()
+        message = client.pack("4i", 64, CONTROL, 2, 0) + client.command(STOP_MOTION)
+        client.motion.sendall(message + message + message[:30])
+        answers = [client.unpack("5i", client.receive()[3][:20]) for _ in range(3)]
+        assert [answer[2:] for answer in answers] == [(STOP_MOTION, OK, 0)] * 2 + [(0, INVALID, 3001)]
 
 
 def test_motoman_has_two_arms_at_one_port() -> None:

@@ -12,6 +12,7 @@ from backends.controller.emulator.tcp.own_speed import OwnSpeed
 from backends.controller.emulator.tcp.packets import (
     END,
     JOINT_TRAJ_PT,
+    PREFIX,
     REPLY,
     REQUEST,
     START_DOWNLOAD,
@@ -36,7 +37,8 @@ _LOOK = 0.01  # s from one look whether the arm rests to the next
 class AbbServer(Server):
     """START and END are points themselves, as the client's first and last; nothing moves before END.
 
-    Anything but a trajectory point is an error that ends the server's program. A lost client stops nothing.
+    Anything but a trajectory point is an error that ends the server's program, and so is a piece of one: it does not
+    wait for the rest. A lost client stops nothing.
     """
 
     state_period = 0.1
@@ -55,6 +57,18 @@ class AbbServer(Server):
         self._own_speed, self._room = own_speed, room
         self._points: list[Array] = []
         self._going: asyncio.Task[None] | None = None
+
+    async def next_message(self, connection: Connection) -> bytes:
+        start = await connection.receive(PREFIX)
+        if not start:
+            return start
+        if len(start) < PREFIX:
+            raise NotAMessage("a piece of a length")
+        length = self.length(start)
+        rest = await connection.receive(length - PREFIX)
+        if len(rest) < length - PREFIX:
+            raise NotAMessage("a piece of a message")
+        return start + rest
 
     async def received(self, connection: Connection, data: bytes) -> None:
         message = self._packing.message(data)

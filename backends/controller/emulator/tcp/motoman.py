@@ -11,12 +11,14 @@ from backends.controller.emulator.tcp.packets import (
     MOTION_CTRL,
     PING,
     POSITION,
+    PREFIX,
     REPLY,
     SUCCESS,
     TIME,
     VELOCITY,
     Command,
     FullPoint,
+    Message,
     NotAMessage,
     Packing,
 )
@@ -69,12 +71,22 @@ class MotomanServer(Server):
         controller.ready = False
         self._groups = {number: _Group(served) for number, served in controller.arms.items()}
 
+    async def next_message(self, connection: Connection) -> bytes:
+        return await connection.receive()
+
     async def received(self, connection: Connection, data: bytes) -> None:
-        try:
-            message = self._packing.message(data)
-        except NotAMessage:
-            await self._answer(connection, 0, 0, 0, INVALID, SIZE)
-            return
+        """All messages that came in one piece; what is left of it is none."""
+        while data:
+            length = self._packing.length(data) if len(data) >= PREFIX else 0
+            try:
+                message = self._packing.message(data[:length])
+            except NotAMessage:
+                await self._answer(connection, 0, 0, 0, INVALID, SIZE)
+                return
+            await self._hear(connection, message)
+            data = data[length:]
+
+    async def _hear(self, connection: Connection, message: Message) -> None:
         if message.kind == PING:
             await self.reply(connection, self._packing.frame(PING, REPLY, SUCCESS))
             if message.body:  # it takes what it does not expect for another message

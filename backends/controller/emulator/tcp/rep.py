@@ -10,16 +10,13 @@ from backends.controller.emulator.faults import FaultSchedule
 from backends.controller.emulator.tcp.controller import Controller, ServedArm
 from backends.controller.emulator.tcp.packets import (
     FAILURE,
-    HEADER,
     JOINT_TRAJ_PT,
     JOINTS,
     PING,
-    PREFIX,
     REPLY,
     REQUEST,
     STOP,
     SUCCESS,
-    NotAMessage,
     Packing,
     Point,
 )
@@ -28,13 +25,12 @@ from backends.controller.emulator.tcp.server import Server, is_reachable
 from backends.controller.emulator.tcp.wires import Connection, Line
 from dualcal_hal.transforms import Array
 
-_LONGEST = 4096  # bytes of a message
 _AHEAD = 0.05  # s that it waits for more points before it moves
 _FASTER = 1.05  # than the arm's own speed is refused
 
 
 class RepServer(Server):
-    """Puts messages together from pieces; replies with and without a body in turn; stops if its client is lost."""
+    """Replies with and without a body in turn; stops if its client is lost."""
 
     state_period = 0.02
 
@@ -45,16 +41,6 @@ class RepServer(Server):
         self._began = 0.0
         self._awaited = 0
         self._bodies = itertools.cycle((False, True))
-
-    async def next_message(self, connection: Connection) -> bytes:
-        start = await connection.receive_exactly(PREFIX)
-        if len(start) < PREFIX:
-            return b""
-        length = self._packing.length(start)
-        if not HEADER <= length <= _LONGEST:
-            raise NotAMessage(f"a length of {length}")
-        rest = await connection.receive_exactly(length - PREFIX)
-        return start + rest if len(rest) == length - PREFIX else b""
 
     async def received(self, connection: Connection, data: bytes) -> None:
         message = self._packing.message(data)

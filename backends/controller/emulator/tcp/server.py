@@ -10,10 +10,11 @@ import numpy as np
 
 from backends.controller.emulator.faults import FaultSchedule
 from backends.controller.emulator.tcp.controller import Controller, ServedArm
-from backends.controller.emulator.tcp.packets import NotAMessage, Packing
+from backends.controller.emulator.tcp.packets import HEADER, PREFIX, NotAMessage, Packing
 from backends.controller.emulator.tcp.wires import Connection, Line
 from dualcal_hal.transforms import Array
 
+_LONGEST = 4096  # bytes of a message
 _BEYOND = 1e-3  # rad by which a point may be beyond a limit
 
 
@@ -43,8 +44,20 @@ class Server(ABC):
             self.client_lost()
 
     async def next_message(self, connection: Connection) -> bytes:
-        """What comes in one piece, which controllers take for one message; empty at the end."""
-        return await connection.receive()
+        """The next message, put together from its pieces; empty at the end. NotAMessage for a length that cannot be."""
+        start = await connection.receive_exactly(PREFIX)
+        if len(start) < PREFIX:
+            return b""
+        length = self.length(start)
+        rest = await connection.receive_exactly(length - PREFIX)
+        return start + rest if len(rest) == length - PREFIX else b""
+
+    def length(self, start: bytes) -> int:
+        """Bytes of the message that begins so. NotAMessage for a length that cannot be."""
+        length = self._packing.length(start)
+        if not HEADER <= length <= _LONGEST:
+            raise NotAMessage(f"a length of {length}")
+        return length
 
     @abstractmethod
     async def received(self, connection: Connection, data: bytes) -> None:

@@ -20,6 +20,7 @@ from backends.controller.emulator.tcp.packets import Packing
 from backends.controller.emulator.tcp.rep import RepServer
 from backends.controller.emulator.tcp.server import Server
 from backends.controller.emulator.tcp.wires import Line, Port
+from backends.controller.promptness import prompt_interpreter, prompt_thread
 from dualcal_hal.errors import UsageError
 
 if TYPE_CHECKING:
@@ -181,7 +182,8 @@ class SimpleMessageServers:
         self._loop.close()
 
     def _run(self) -> None:
-        self._loop.run_until_complete(self._serve())
+        with prompt_interpreter(), prompt_thread():
+            self._loop.run_until_complete(self._serve())
 
     async def _serve(self) -> None:
         for station in self._stations:

@@ -93,10 +93,10 @@ class Connection:
         self._loop = asyncio.get_running_loop()
         self.dead = False
 
-    async def receive(self) -> bytes:
+    async def receive(self, most: int = _MOST) -> bytes:
         """What is there, in one piece; empty at its end."""
         while True:
-            data = await self._loop.sock_recv(self._socket, _MOST)
+            data = await self._loop.sock_recv(self._socket, most)
             if not self.dead or not data:
                 return data
 

@@ -14,6 +14,7 @@ from backends.simulator.robot import SimulatedRobot
 from dualcal_hal.cellfile import load_cell
 from dualcal_hal.commissioning import Commissioning
 from dualcal_hal.errors import LinkLost
+from dualcal_hal.findings import Finding
 from dualcal_hal.robot import JointPath, Mode, Robot, RobotState, StopResult
 from tests.cells import TINY
 from tests.command_line import dualcal
@@ -513,3 +514,15 @@ def test_an_interrupt_stops_the_arm_on_its_way_and_nothing_is_recorded(real, mon
     assert stopped[0] == ("left", "interrupted by SIGINT")
     assert ("use the emergency stop" in result.stderr) == (not confirmed)
     assert not record(real).path.exists()
+
+
+def test_long_lines_of_a_device_are_folded_and_never_cut(monkeypatch):
+    said = "a sentence that says all there is to say of a thing, and goes on and on for longer than a line has room"
+    found = [Finding("joint 1 (node 1) heartbeat", said, "note", "x" * 100)]
+    monkeypatch.setattr(SimulatedRobot, "findings", lambda self: found)
+    output = dualcal("doctor", TINY).output
+    assert max(map(len, output.splitlines())) <= 80
+    words = " ".join(output.split())
+    assert "heartbeat" in words
+    assert "longer than a line has room" in " ".join(line[29:].strip() for line in output.splitlines())
+    assert output.count("x") >= 100

@@ -152,7 +152,7 @@ def _table(examined: Examined) -> Table:
     title = Text(f"{examined.device}, by {examined.reached}", "bold")
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, show_header=False)
     table.add_column(no_wrap=True, width=7)
-    table.add_column(no_wrap=True, max_width=18)
+    table.add_column(max_width=20)
     table.add_column(overflow="fold")
     for finding in examined.findings:
         said = Text(finding.said)

@@ -16,6 +16,10 @@ from dualcal_hal.transforms import Array
 FEEDBACK_PERIODS, LEAST_FEEDBACK_AGE = 3.0, 0.1
 """Feedback is too old after this many of its periods, and not before this many seconds."""
 
+PERIOD_KNOWN_WITHIN = 0.5
+"""Seconds for which no state may come before the period of the feedback is known: the slowest controllers tell ten a
+second."""
+
 OFF_THE_PATH = 0.05
 """rad that a joint may be off the path while it moves: lag along the path is none."""
 
@@ -160,8 +164,8 @@ class _Feedback:
 
     def wrong(self, arm: str, now: float) -> DeviceError | None:
         age, allowed = now - self._arrived, max(LEAST_FEEDBACK_AGE, FEEDBACK_PERIODS * self._period)
-        if self.newest is None:
-            allowed = 1.0  # none has come since the watch began
+        if not self._period:
+            allowed = PERIOD_KNOWN_WITHIN
         if age > allowed:
             why = f"no state for {age:.2f} s where {allowed:.2f} s are allowed"
             return DeviceTimeout(arm, "watch", why, "check the link; both arms are stopped")

@@ -23,7 +23,7 @@ LINKS = ("rep", "abb", "fanuc", "motoman", "can")
 
 @dataclass(frozen=True)
 class Outcome:
-    """mean, largest: mm of mismatch; rotation, translation: deg and mm of T_P_A's error; least: as the emulator says."""
+    """mean, largest: mm of mismatch; rotation, translation: T_P_A's error, deg and mm; least: as the emulator says."""
 
     code: int
     seconds: float

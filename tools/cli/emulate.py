@@ -15,6 +15,7 @@ from types import FrameType
 import typer
 
 from backends.controller.emulator.process import FORMAT, Emulator
+from backends.controller.promptness import go_before_others
 from dualcal_hal.errors import DeviceError
 from tools.cli.terminal import plain
 
@@ -32,6 +33,7 @@ class EmulateOptions:
 
 def emulate(options: EmulateOptions) -> None:
     """Serve until a signal comes, or until standard input closes if that was asked for."""
+    go_before_others()  # a controller has a machine of its own
     # Of all ways to tell another thread, this queue alone may be used in a signal's handler.
     ended: SimpleQueue[str | None] = SimpleQueue()
 

@@ -29,9 +29,9 @@ from backends.controller.can.objects import (
     pack_command,
 )
 from backends.controller.can.objects import HEARTBEAT as HEARTBEAT_FRAME
-from backends.controller.can.promptness import prompt_interpreter, prompt_thread
 from backends.controller.can.statistics import CycleStatistics
 from backends.controller.link import ArmReport, Transfer
+from backends.controller.promptness import prompt_interpreter, prompt_thread
 from dualcal_hal.clock import Clock
 from dualcal_hal.errors import DeviceError, DeviceTimeout, LinkLost, MotionStopped
 from dualcal_hal.robot import Mode
@@ -145,7 +145,12 @@ class Cycle:
     @property
     def is_silent(self) -> bool:
         """Whether a drive did not answer in the last cycle."""
-        return any(watch.silent for watch in self._watch)
+        return bool(self.silent)
+
+    @property
+    def silent(self) -> list[str]:
+        """Those drives."""
+        return [watch.axis.name for watch in self._watch if watch.silent]
 
     def want(self, goal: Goal) -> None:
         """Have each drive led towards ``goal``, a step in each cycle."""

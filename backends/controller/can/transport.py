@@ -14,8 +14,8 @@ from typing import Any, Protocol
 
 import can
 
-from backends.controller.can.promptness import prompt_thread
 from backends.controller.can.socketcand import Frame, SocketcandWire, address_of
+from backends.controller.promptness import prompt_thread
 from dualcal_hal.clock import Clock
 from dualcal_hal.errors import CommandRefused, DeviceError, DeviceTimeout, LinkLost
 

@@ -13,6 +13,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterable
 
+from backends.controller.promptness import prompt_interpreter, prompt_thread
 from dualcal_hal.clock import Clock
 
 TICK = 0.005
@@ -163,8 +164,9 @@ class Hub:
     def _run(self) -> None:
         try:
             next_tick = self._clock.now()
-            while not self._closing:
-                next_tick = self._turn(next_tick)
+            with prompt_interpreter(), prompt_thread():
+                while not self._closing:
+                    next_tick = self._turn(next_tick)
         finally:
             # Whatever ends it, nobody is left to wait for frames that do not come.
             for client in self._clients:

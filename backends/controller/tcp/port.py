@@ -6,6 +6,7 @@ import threading
 from abc import ABC, abstractmethod
 from typing import NoReturn
 
+from backends.controller.promptness import prompt_interpreter, prompt_thread
 from backends.controller.tcp.transport import Address, Connection
 from dualcal_hal.clock import Clock
 from dualcal_hal.errors import DeviceError, LinkLost
@@ -93,7 +94,8 @@ class Port(ABC):
     def _end_of(self, connection: Connection) -> DeviceError:
         """Serve a connection; why that ended."""
         try:
-            self._serve(connection)
+            with prompt_interpreter(), prompt_thread():
+                self._serve(connection)
         except DeviceError as error:
             return error
         except Exception as error:  # noqa: BLE001 - a thread that died silently would leave its arm unwatched

@@ -13,6 +13,10 @@ _SWITCH = 1e-4
 waits for it once with each system call that it makes."""
 
 
+_BEFORE_OTHERS = -10
+"""Niceness of what stands for a machine of its own."""
+
+
 class _SwitchInterval:
     """The interpreter's, as short as above while somebody needs it."""
 
@@ -64,3 +68,9 @@ def prompt_thread() -> Iterator[bool]:
         if granted:
             with suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def go_before_others() -> None:
+    """Have this process, and the threads it starts from here on, go before the machine's other work where permitted."""
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, _BEFORE_OTHERS)

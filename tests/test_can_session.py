@@ -221,7 +221,7 @@ def test_a_fault_that_stands_is_reported_with_its_code(arm, bus):
 
 
 def test_a_link_is_used_only_while_it_is_open(arm):
-    for use in (arm.report, lambda: arm.link.enable(1.0), lambda: arm.link.stop("test")):
+    for use in (arm.report, lambda: arm.link.enable(1.0), lambda: arm.link.stop("test"), arm.link.findings):
         with pytest.raises(NotOpen):
             use()
     arm.open()
@@ -579,6 +579,61 @@ def test_findings_tell_bus_drives_and_cycle(enabled, bus):
     said = {finding.subject: finding for finding in enabled.link.findings()}
     assert said["joint 2 (node 2) state"].verdict == "problem"
     assert "0x7305 encoder fault" in said["joint 2 (node 2) state"].said
+
+
+EDS = """
+[DeviceInfo]
+VendorName=Some Maker
+VendorNumber=0x1234
+ProductName=Servo 7
+ProductNumber=0x{product:X}
+[MandatoryObjects]
+SupportedObjects=0
+[OptionalObjects]
+SupportedObjects=0
+[ManufacturerObjects]
+SupportedObjects=0
+"""
+
+
+@pytest.mark.parametrize(
+    ("sheet", "verdict", "words"),
+    [
+        (EDS.format(product=0x42), "good", "Some Maker, Servo 7"),
+        (EDS.format(product=0x43), "problem", "product 0x42, not 0x43"),
+        ("[DeviceInfo", "problem", "cannot be read"),
+        (None, "problem", "no such file"),
+    ],
+)
+def test_a_drive_is_held_against_its_data_sheet(bus, channel, tmp_path, sheet, verdict, words):
+    path = tmp_path / "drive.eds"
+    if sheet is not None:
+        path.write_text(sheet)
+    arm = Arm(bus, channel, eds=str(path))
+    try:
+        arm.open()
+        said = {finding.subject: finding for finding in arm.link.findings()}
+        assert said["joint 2 (node 2) data sheet"].verdict == verdict
+        assert words in said["joint 2 (node 2) data sheet"].said
+    finally:
+        arm.link.close()
+
+
+def test_a_closed_link_that_was_lost_is_left_alone(arm, bus, monkeypatch):
+    """Closed while it is connecting anew, at whatever moment, it ends."""
+    arm.open()
+    again = threading.Event()
+    connect = arm.link._connect
+
+    def slowly(deadline):
+        again.set()
+        return connect(deadline)
+
+    monkeypatch.setattr(arm.link, "_connect", slowly)
+    arm.link._cycle.lose(LinkLost("left", "receive", "test"))
+    assert again.wait(PATIENCE)
+    arm.link.close()
+    assert states(bus) == [SWITCH_ON_DISABLED] * 3
 
 
 def test_an_arm_has_one_drive_for_each_joint(channel):

@@ -67,8 +67,11 @@ class DriveRecord:
 def switch_off(sdo: SdoNode) -> None:
     """Switch a drive off that is enabled, as a program that is gone may have left it; no word if it does not answer."""
     with suppress(DeviceTimeout, CommandRefused):
-        if state_of(sdo.read_number(0x6041)) is State.OPERATION_ENABLED:
+        state = state_of(sdo.read_number(0x6041))
+        if state is State.OPERATION_ENABLED:
             sdo.write(0x6040, 0, Control.SHUTDOWN, 2)
+        elif state is State.QUICK_STOP:
+            sdo.write(0x6040, 0, Control.DISABLE_VOLTAGE, 2)
 
 
 def is_there(sdo: SdoNode) -> bool:

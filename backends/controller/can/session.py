@@ -108,7 +108,7 @@ class CanArmLink(ArmLink):
         self._thread.start()
         try:
             self.report_after(begin, deadline)
-        except DeviceError:
+        except BaseException:
             self.close()
             raise
 
@@ -116,11 +116,10 @@ class CanArmLink(ArmLink):
         thread, self._thread = self._thread, None
         if thread is None:
             return
-        cycle = self._cycle
-        if cycle is not None:
+        if (cycle := self._cycle) is not None:
             self._switch_off(cycle)
         self._closing.set()
-        if cycle is not None:
+        if (cycle := self._cycle) is not None:  # another one where it has just been connected anew
             cycle.end()
         thread.join()
         if (waypoints := self._waypoints) is not None:
@@ -132,9 +131,9 @@ class CanArmLink(ArmLink):
         """No drive is left enabled without one that leads it, and none misses this program's heartbeat."""
         cycle.stop("the link is closed", _STOP_TOLD)
         deadline = self._clock.now() + _SHUT_DOWN
-        cycle.wait_for(lambda: not cycle.is_moving, deadline)
+        cycle.wait_for(lambda: not cycle.is_moving or cycle.is_silent, deadline)
         cycle.want(Goal.OFF)
-        cycle.wait_for(lambda: all(is_off(axis.state) for axis in self._axes), deadline)
+        cycle.wait_for(lambda: all(is_off(axis.state) for axis in self._axes) or cycle.is_silent, deadline)
         for sdo in self._sdo.values():
             try:
                 leave(sdo)
@@ -160,7 +159,7 @@ class CanArmLink(ArmLink):
                 supervise(self._sdo[axis.node], self._master)
             self._by_node = {axis.node: axis for axis in self._axes}
             self._tell_nodes(NmtCommand.START)
-        except DeviceError:
+        except BaseException:
             self._transport.close()
             raise
         cycle = Cycle(
@@ -206,10 +205,10 @@ class CanArmLink(ArmLink):
     def _live(self, cycle: Cycle) -> None:
         """Run the cycle; after a loss connect anew, until the link is closed."""
         while True:
-            loss = cycle.run()
+            loss = cycle.run() if not self._closing.is_set() else None
             if loss is not None:
                 self._lost(loss)
-            self._let_go()
+            self._let_go(cycle.is_moving)
             if loss is None or (again := self._reconnect()) is None:
                 return
             cycle = again
@@ -221,16 +220,18 @@ class CanArmLink(ArmLink):
         self._wake()
         self._notices.failure(loss)
 
-    def _let_go(self) -> None:
+    def _let_go(self, moving: bool) -> None:
         """Leave no drive enabled that can still be told so, and the bus closed."""
+        word = Control.QUICK_STOP if moving else Control.SHUTDOWN
         shutdown = [
-            (RPDO1 + axis.node, pack_command(Control.SHUTDOWN, self._operation, axis.position))
+            (RPDO1 + axis.node, pack_command(word, self._operation, axis.position))
             for axis in self._axes
             if axis.state in (State.OPERATION_ENABLED, State.QUICK_STOP)
         ]
         try:
             self._transport.send_all([*shutdown, (SYNC, b"")])
-            self._tell_nodes(NmtCommand.PRE_OPERATIONAL)
+            if not moving:
+                self._tell_nodes(NmtCommand.PRE_OPERATIONAL)
         except DeviceError:
             pass  # the bus is gone; drives that miss the heartbeat stop by themselves
         self._transport.close()
@@ -366,8 +367,10 @@ class CanArmLink(ArmLink):
         other = [axis.name for axis in self._axes if axis.feedback and axis.feedback.operation != self._operation]
         if other:
             return f"{', '.join(other)}: not in mode {self._operation:d}, as 6061 says"
-        if cycle.failure is not None and cycle.is_silent:
-            return f"the last failure lasts: {cycle.failure}"
+        age = self._clock.now() - self._report.time
+        if age > max(3 * self._period, 0.1):
+            silent = ", ".join(cycle.silent) or "all of them together"
+            return f"the drives' positions are {age:.2f} s old; none came of {silent}"
         return "a motion is under way" if cycle.is_led else ""
 
     def _why_not_taken(self, course: Course, cycle: Cycle) -> str:
@@ -467,6 +470,8 @@ class CanArmLink(ArmLink):
 
     def findings(self) -> list[Finding]:
         cycle, records = self._cycle, self._records
+        if self._thread is None:
+            raise NotOpen(self.arm, "check", "it is not open")
         if cycle is None:
             return [bus_finding(self._address, self._transport.statistics, self._loss)]
         found = [bus_finding(self._address, self._transport.statistics, None)]

@@ -181,6 +181,16 @@ def test_a_brake_is_the_halt_bit_and_no_set_point():
     assert not lead.is_told
 
 
+def test_a_set_point_that_comes_after_a_brake_is_not_handed_over_nor_waited_for():
+    drives, lead = Drives(), SetPointLead(halted=False, arrival=2)
+    drives.say(0x27, 0x27)
+    lead.brake()
+    lead.go([100, -50], is_last=True)
+    assert drives.bits(lead) == {HALT}
+    assert [axis.target for axis in drives.axes] == [0, 0]
+    assert lead.wake.is_set()
+
+
 def test_the_halt_bit_stays_until_the_next_set_point_is_taken():
     drives, lead = Drives(), SetPointLead(halted=True, arrival=2)
     drives.say(0x27, 0x27)

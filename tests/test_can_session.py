@@ -555,14 +555,26 @@ def test_a_link_that_is_lost_can_be_closed(enabled, bus):
     assert time.monotonic() - begin < 5.0
 
 
-def test_a_slow_or_failing_listener_holds_nothing_up(enabled, bus):
+def test_a_slow_listener_holds_no_cycle_up(enabled, bus):
     release = threading.Event()
     enabled.link.subscribe(lambda report: release.wait(PATIENCE))
-    assert enabled.ended is not None
     cycles = bus.syncs
     enabled.until(lambda: bus.syncs > cycles + 20)
     assert enabled.report().mode is Mode.READY
     release.set()
+
+
+def test_a_listener_that_raises_is_heard_of_and_takes_nothing_from_the_others(enabled, bus, monkeypatch):
+    seen, reports = [], []
+    monkeypatch.setattr(threading, "excepthook", seen.append)
+    end_bad = enabled.link.subscribe(lambda report: 1 / 0)
+    end_good = enabled.link.subscribe(reports.append)
+    enabled.until(lambda: len(reports) > 3)
+    assert seen[0].exc_type is ZeroDivisionError
+    end_bad()
+    end_good()
+    sequences = [report.sequence for report in reports]
+    assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
 
 
 def test_findings_tell_bus_drives_and_cycle(enabled, bus):

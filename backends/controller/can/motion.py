@@ -147,8 +147,10 @@ class SetPointLead(Lead):
         """Set when the set-point is reached, or none will be any more."""
 
     def go(self, targets: Sequence[int], is_last: bool) -> None:
-        """Hand ``targets`` over in the next cycle, counts."""
+        """Hand ``targets`` over in the next cycle, counts; none any more once it brakes."""
         with self._lock:
+            if self.is_braking:
+                return
             self.wake.clear()
             self._targets, self._last_one = targets, is_last
             self._handshake = _Handshake.PRESENTED

@@ -49,6 +49,8 @@ class Notices:
         return _added(self._on_failure, function)
 
     def report(self, report: ArmReport) -> None:
+        if not self._on_report:
+            return  # a thread that is not woken takes no interpreter from the cycle
         with self._changed:
             self._reports.append(report)
             self._changed.notify()

@@ -17,7 +17,7 @@ TICK = 1 / 240
 DELAY = 0.01
 """Seconds that a command takes to the motors."""
 
-RESERVE = 1.5
+RESERVE = 5.0
 """By how much the drives can accelerate beyond what the cell file allows to motions."""
 
 _POSITION_GAIN, _VELOCITY_GAIN = 50.0, 200.0  # 1/s: critically damped, as the one is four times the other

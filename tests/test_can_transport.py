@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backends.controller.can.promptness import prompt_interpreter, prompt_thread
 from backends.controller.can.socketcand import Frame, SocketcandWire, address_of
 from backends.controller.can.transport import BusAddress, Transport
+from backends.controller.promptness import prompt_interpreter, prompt_thread
 from dualcal_hal.clock import RealClock
 from dualcal_hal.errors import CommandRefused, DeviceError, DeviceTimeout, LinkLost
 

@@ -542,6 +542,9 @@ def test_a_point_that_is_not_answered_fails_the_course_and_has_the_arm_stop() ->
         assert "left" in str(transfer.error)
         server.wait_for(lambda: server.sequences()[-1] == -4)
         assert server.sequences() == [0, 1, 2, -4]
+        # Nobody knows which reply is whose: it goes on with a new connection.
+        assert isinstance(Told(link).first(LinkLost), LinkLost)
+        _until(lambda: ended(link.send(course(0.0))).complete)
 
 
 @pytest.mark.usefixtures("impatient")

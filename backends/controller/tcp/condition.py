@@ -37,6 +37,11 @@ def mode(status: Status | None, unknown_is_ready: bool) -> Mode:
     return Mode.READY if told or unknown_is_ready else Mode.UNKNOWN
 
 
+def is_enabled(status: Status) -> bool:
+    """Whether the drives are on, and motion is possible where the controller says so."""
+    return known(status.drives_powered) is True and known(status.motion_possible) is not False
+
+
 def faults(status: Status | None) -> tuple[str, ...]:
     """The controller's error, with its code."""
     if status is None or not known(status.in_error):

@@ -127,9 +127,13 @@ class MotionPort(Port):
     def stop(self, arm: str, message: Message) -> None:
         """Put a stop on the wire before all else: after a reply that is awaited, if that comes soon; LinkLost."""
         packet = self.packet(arm, message)
-        request = Request(arm, message, packet, self._clock.now() + self._dialect.acknowledges_within)
+        now = self._clock.now()
+        request = Request(arm, message, packet, now + self._dialect.acknowledges_within)
         with self._lock:
             self._connected("stop")
+            if any(now >= before.deadline for before in self._sent):
+                # A reply is missing already: if it stays so, the connection is soon made anew.
+                request.deadline = now
             self._waiting.appendleft(request)
             self._advance()
         # The thread that reads replies must not wait for one.
@@ -199,8 +203,7 @@ class MotionPort(Port):
 
     def _look(self, now: float) -> None:
         with self._lock:
-            overdue = self._sent[0].deadline + _LATE if self._sent else now + 1.0
-            if now >= overdue:
+            if self._sent and now >= min(request.deadline for request in self._sent) + _LATE:
                 why = f"{self.address} does not answer"
                 raise LinkLost(self._arm, "read", why, "check the controller's motion program and the network")
             if self._dialect.pings and not self._sent and now >= self._traffic + PING_EVERY:

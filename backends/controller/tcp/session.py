@@ -151,7 +151,7 @@ class SimpleMessageArm(ArmLink):
             raise CommandRefused(self.arm, "enable", why, f"{advice}, or reset it first")
         self._command(motoman, START_SERVOS, "enable", deadline)
         self._command(motoman, START_COMMANDS, "enable", deadline)
-        self._await("enable", lambda status: condition.known(status.drives_powered) is True, deadline)
+        self._await("enable", condition.is_enabled, deadline)
 
     def disable(self, timeout: float) -> None:
         motoman, deadline = self._switching("disable"), self._clock.now() + timeout

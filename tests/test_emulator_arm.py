@@ -95,6 +95,22 @@ def test_drives_are_no_faster_than_they_can_be_and_do_not_overshoot() -> None:
     assert q[-1] == pytest.approx(goal, abs=1e-9)
 
 
+def test_set_points_that_come_late_and_all_at_once_do_not_lead_off_a_straight_way() -> None:
+    file = tcp_cell()
+    drives, trajectory = servo(file), planned(file)
+    home, way = file.cell.active.home, np.array(trajectory.destination) - file.cell.active.home
+    cycles = np.arange(0.0, trajectory.end + 0.02, 0.01)
+    for due in cycles:
+        came = due if not 0.2 < due < 0.3 else 0.3 + (due - 0.2) * 1e-3  # nothing came for 0.1 s
+        drives.tell(Ramp(drives.commanded(came), trajectory.sample(due)[0], 0.01), came)
+    off = []
+    for t in np.arange(0.0, trajectory.end + 0.5, TICK):
+        gone = drives.sample(t)[0] - home
+        off.append(np.max(np.abs(gone - (gone @ way) / (way @ way) * way)))
+    assert max(off) < 2e-3
+    assert drives.sample(9.0)[0] == pytest.approx(home + way, abs=1e-6)
+
+
 def test_braking_stays_on_the_way_and_begins_at_once() -> None:
     file = tcp_cell()
     robot, drives, trajectory = file.cell.active, servo(file), planned(file)

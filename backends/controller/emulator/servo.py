@@ -135,9 +135,9 @@ class Servo:
         now = before + TICK
         sought, sought_velocity, rests = self._told_at(now - DELAY)
         off = sought - (q + TICK * v)
-        # No faster than it can still brake before it is there.
-        approach = np.minimum(_POSITION_GAIN * np.abs(off), np.sqrt(2.0 * self._brake * np.abs(off)))
-        wanted = _within(sought_velocity + np.sign(off) * approach, self._speed)
+        # No faster than it can still brake before it is there, and all joints in proportion.
+        room = float(np.min(self._brake / np.maximum(np.abs(off), 1e-12)))
+        wanted = _within(sought_velocity + min(_POSITION_GAIN, math.sqrt(2.0 * room)) * off, self._speed)
         change = _within(TICK * _VELOCITY_GAIN * (wanted - v), TICK * self._acceleration)
         v = v + change
         q = q + TICK * v

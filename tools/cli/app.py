@@ -55,8 +55,9 @@ def run(
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Move without asking, on a cell that is not simulated.")] = False,
     speed: Annotated[
-        float, typer.Option(min=0.05, max=1.0, help="Share of the arms' speed; below all other limits.")
-    ] = 1.0,
+        float | None,
+        typer.Option(min=0.05, max=1.0, help="Share of the arms' speed, below all other limits. Default: all of it."),
+    ] = None,
     enable: Annotated[
         bool, typer.Option("--enable", help="Switch the drives on first, where that ends with the program (CAN).")
     ] = False,

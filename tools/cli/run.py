@@ -74,7 +74,7 @@ class RunOptions:
     log: bool = True
     json: bool = False
     resume: Path | None = None
-    speed: float = 1.0
+    speed: float | None = None
     emulate: bool = False
     enable: bool = False
     faults: tuple[str, ...] = ()
@@ -243,7 +243,8 @@ def kept(session: Session, *, can_be_estimated: bool = True) -> Iterator[None]:
         yield
     except BaseException as error:
         folder = shlex.quote(str(session.folder))
-        error.add_note(f"the session is kept; to go on with it: dualcal run --resume {folder}")
+        again = f"{folder} --emulate" if read_conduct(session).emulated else folder
+        error.add_note(f"the session is kept; to go on with it: dualcal run --resume {again}")
         if can_be_estimated:
             error.add_note(f"what it has so far: dualcal estimate {folder}")
         raise
@@ -431,8 +432,13 @@ def cell_at_pace(options: RunOptions, file: CellFile, path: Path) -> Cell:
         raise UsageError("--emulate puts an emulator behind real wires; this cell has its own simulator: go without")
     if options.faults and not options.emulate:
         raise UsageError("--fault is for the emulator: it goes with --emulate")
+    begun = Conduct() if options.resume is None else read_conduct(Session(options.resume))
+    if options.resume is not None and begun.emulated != options.emulate:
+        said = "an emulator's: go on with --emulate" if begun.emulated else "no emulator's: go on without --emulate"
+        raise UsageError(f"{options.resume}: the session's devices were {said}")
     free = cell.simulated or options.emulate or Commissioning.of(path, file).verified
-    return Cell(file, Pace(options.speed, None if free else REDUCED_SPEED))
+    share = begun.pace.share if options.speed is None else options.speed
+    return Cell(file, Pace(share, None if free else REDUCED_SPEED))
 
 
 def commissioned(cell: Cell, options: RunOptions, file: CellFile, path: Path) -> Commissioning | None:

@@ -73,7 +73,7 @@ def parse_fault(text: str, arms: Iterable[str]) -> Fault:
     """A fault as the command line has it; UsageError.
 
     WHEN is seconds after the begin (``12.5``), or ``motion:3`` (0.1 s into the third motion of that arm, or of any if
-    none is named), or ``point:7`` (as its seventh trajectory point, or changed target, comes).
+    none is named), or ``point:7`` (as its seventh trajectory point comes, by TCP).
     """
     what, at, rest = text.partition("@")
     name, colon, arm = what.partition(":")
@@ -144,7 +144,7 @@ class FaultSchedule:
             self._at(self._clock.now() + _INTO_MOTION, fault, arm.name)
 
     def pointed(self, arm: str) -> None:
-        """A trajectory point, or a changed target, of that arm has come."""
+        """A trajectory point of that arm has come."""
         for fault in self._counted("point", arm):
             self._come(fault, arm)
 

@@ -85,6 +85,11 @@ class Emulator:
             world.on_contact(servers.touched)
             self.endpoints[name] = {"tcp": servers.endpoints}
         elif options.link.can is not None:
+            for fault in self._faults:
+                if fault.when.kind == "point":
+                    raise UsageError(
+                        f"--fault {fault}: drives on CAN get no trajectory points; give seconds or motion:N"
+                    )
             from backends.controller.emulator.drives import FAULTS, DriveBuses
 
             arms = {arm: world.arms[arm] for arm in options.link.can.arms}

@@ -116,6 +116,13 @@ def test_drives_held_beside_the_begin_are_led_there_first():
     assert np.all(np.diff(led[:, 0]) < 0)
 
 
+def test_proportioned_joints_that_have_no_way_to_go_do_not_move():
+    for way in ((0.0, 0.0), (1e-308, 0.0)):
+        velocities, accelerations = proportioned(np.array(way), np.ones(2), np.ones(2))
+        assert not velocities.any()
+        assert not accelerations.any()
+
+
 @settings(max_examples=50)
 @given(st.tuples(angles, angles), st.tuples(st.floats(0.1, 2.0), st.floats(0.1, 2.0)))
 def test_proportioned_joints_arrive_together_and_keep_their_bounds(way, bounds):

@@ -22,6 +22,7 @@ HOLD_AT, SLOW_AT, STOP_AT = 1, 2, 3
 
 _RECOVERY = 0.1  # of the course's speed, gained back by each cycle in time
 _ROUNDING = 1e-6
+_NO_WAY = 1e-12  # rad
 _LEAD_IN = 0.5  # of the course's speed, at which the drives are led to where it begins
 
 
@@ -203,7 +204,7 @@ def proportioned(way: Array, speed: Array, acceleration: Array) -> tuple[Array, 
     The largest that keep ``speed`` and ``acceleration`` (n,), all in one unit of angle; zero where there is no way.
     """
     distance = np.abs(way)
-    if not distance.any():
+    if np.max(distance, initial=0.0) < _NO_WAY:
         return np.zeros_like(distance), np.zeros_like(distance)
     gain = 1.0 / float(np.max(distance / acceleration))
     peak = min(1.0 / float(np.max(distance / speed)), gain**0.5)

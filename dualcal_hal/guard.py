@@ -156,7 +156,7 @@ class CellGuard:
             corner=self._corridor / _LEVER,
             clearance=clearance,
             least=least - WATCH_SLACK - self._corridor,
-            speed=lambda q, velocity: part_speed(body, q, velocity),
+            speed=lambda before, after, seconds: part_speed(body, before, after, seconds),
             fastest=self._pace.bound,
         )
 

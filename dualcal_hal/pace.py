@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,19 +13,19 @@ from dualcal_hal.geometry import ArmBody
 from dualcal_hal.geometry.distance import length
 from dualcal_hal.limits import JointLimits
 from dualcal_hal.robot import JointPath, Joints
-from dualcal_hal.transforms import Array
 
 REDUCED_SPEED = 0.250
 """m/s that no part of an arm exceeds until a calibration of the cell was verified: the reduced speed of ISO 10218-1."""
 
 _STEP = 0.02  # rad; over it a chord is shorter than its arc by less than 2e-5
 _CHORDS = 1.0001
-_INSTANT = 1e-4  # s
+_AIM = 0.98  # of a bound: what is read of where an arm stands scatters, and the bound is held against it once more
 
 
 @dataclass(frozen=True)
 class Pace:
-    """share: of the speeds in the cell file, at most 1; largest: m/s that no part may exceed, None for no bound."""
+    """share: of the speeds and accelerations in the cell file, at most 1; largest: m/s that no part may exceed, None
+    for no bound."""
 
     share: float = 1.0
     largest: float | None = None
@@ -38,12 +39,16 @@ class Pace:
 
     def path(self, start: Joints, waypoints: tuple[Joints, ...], limits: JointLimits, body: ArmBody) -> JointPath:
         """The fastest path through ``waypoints`` (rad) that this and the arm's ``limits`` allow."""
-        speed, acceleration = self.share * limits.speed, tuple(map(float, limits.acceleration))
-        path = JointPath(waypoints, tuple(map(float, speed)), acceleration)
+        path = _scaled(JointPath(waypoints, tuple(limits.speed), tuple(limits.acceleration)), self.share)
         bound = self.bound
-        if bound is None or (fastest := fastest_part(body, start, path)) <= bound:
+        if bound is None:
             return path
-        return replace(path, speed=tuple(map(float, speed * bound / fastest)))
+        slower = [
+            _AIM * bound / (segment.farthest * segment.at_speed)
+            for segment in _segments(body, start, path)
+            if segment.speed > _AIM * bound
+        ]
+        return _scaled(path, min(slower, default=1.0))
 
     @property
     def bound(self) -> float | None:
@@ -62,8 +67,32 @@ FULL_PACE = Pace()
 
 
 def fastest_part(body: ArmBody, start: ArrayLike, path: JointPath) -> float:
-    """The highest speed (m/s) that any part of the arm can come to on ``path`` from ``start`` (n,) in rad."""
-    fastest = 0.0
+    """The highest speed (m/s) that any part of the arm comes to on ``path`` from ``start`` (n,) in rad."""
+    return max((segment.speed for segment in _segments(body, start, path)), default=0.0)
+
+
+def _scaled(path: JointPath, share: float) -> JointPath:
+    """The same at a share of its speed; it speeds up as gently, so that it takes as long to come to its speed."""
+    speed, acceleration = (tuple((share * np.array(bound)).tolist()) for bound in (path.speed, path.acceleration))
+    return replace(path, speed=speed, acceleration=acceleration)
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """A straight way between two rests. farthest: m that a part moves for a share of it, where that is most; at_speed,
+    at_most: shares a second at the path's speed, and those that the way is long enough to come to."""
+
+    farthest: float
+    at_speed: float
+    at_most: float
+
+    @property
+    def speed(self) -> float:
+        """Of the fastest part, m/s."""
+        return self.farthest * min(self.at_speed, self.at_most)
+
+
+def _segments(body: ArmBody, start: ArrayLike, path: JointPath) -> Iterator[_Segment]:
     points = np.array([start, *path.waypoints], dtype=float)
     for begin, end in itertools.pairwise(points):
         way = end - begin
@@ -72,12 +101,13 @@ def fastest_part(body: ArmBody, start: ArrayLike, path: JointPath) -> float:
         steps = 1 + int(np.ceil(np.max(np.abs(way)) / _STEP))
         shares = np.linspace(0.0, 1.0, steps + 1)
         moved = length(np.diff(body.segments(begin + shares[:, None] * way), axis=0)).max()
-        shares_a_second = 1.0 / float(np.max(np.abs(way) / np.array(path.speed)))
-        fastest = max(fastest, float(_CHORDS * moved * steps * shares_a_second))
-    return fastest
+        at_speed = 1.0 / float(np.max(np.abs(way) / np.array(path.speed)))
+        # Half of the way speeds up, half slows down, by the joint that needs most for it.
+        at_most = float(np.max(np.abs(way) / np.array(path.acceleration))) ** -0.5
+        yield _Segment(float(_CHORDS * moved * steps), at_speed, at_most)
 
 
-def part_speed(body: ArmBody, q: Array, velocity: Array) -> float:
-    """The speed (m/s) of the fastest part of an arm at joint angles (n,) in rad that change by (n,) rad/s."""
-    there, later = body.segments(np.array([q, q + _INSTANT * velocity]))
-    return float(length(later - there).max() / _INSTANT)
+def part_speed(body: ArmBody, before: ArrayLike, after: ArrayLike, seconds: float) -> float:
+    """The mean speed (m/s) of the fastest part of an arm that came from joint angles (n,) to others in ``seconds``."""
+    there, here = body.segments(np.array([before, after], dtype=float))
+    return float(length(here - there).max() / seconds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -29,6 +30,10 @@ LOOK_EVERY = 0.05
 SPEED_SLACK = 1.1, 0.02
 """Factor and m/s by which the observed speed may exceed the bound: it is worked out from readings."""
 
+SPEED_OVER = 0.1
+"""Seconds over which a speed is observed, or from one state to the next where these are farther apart."""
+
+_REMEMBERED = 1.0  # s
 _PERIOD_SHARE = 0.2  # of a new interval in the mean of them
 
 
@@ -38,8 +43,8 @@ class Bounds:
 
     other: the arm beside the one that moves; standing: where that stands, rad. waypoints: (w, n) rad, where the moving
     one stands first. corner: rad more that it may be off the path. clearance: of the moving arm's joint angles (n,) in
-    rad and the other's, m; least: m that it may not fall below. speed: of its joint angles and velocities, m/s;
-    fastest: m/s that it may not exceed, None for any.
+    rad and the other's, m; least: m that it may not fall below. speed: between two of its postures (rad) so many s
+    apart, m/s; fastest: m/s that it may not exceed, None for any.
     """
 
     other: Robot
@@ -48,7 +53,7 @@ class Bounds:
     corner: float
     clearance: Callable[[Array, Array], float]
     least: float
-    speed: Callable[[Array, Array], float]
+    speed: Callable[[Joints, Joints, float], float]
     fastest: float | None
 
 
@@ -104,8 +109,8 @@ class Watch:
         state, other = (self._feedback[robot.name].newest for robot in (self._moving, self._other))
         if state is None:
             return None
-        q, velocity = np.array(state.positions), np.array(state.velocities)
-        return self._off_path(q) or self._too_fast(q, velocity) or self._too_close(q, other) or self._other_moved(other)
+        q = np.array(state.positions)
+        return self._off_path(q) or self._too_fast(state) or self._too_close(q, other) or self._other_moved(other)
 
     def _off_path(self, q: Array) -> DeviceError | None:
         off = off_path(self._bounds.waypoints, q)
@@ -114,12 +119,13 @@ class Watch:
             return None
         return self._failed(f"joint {joint + 1} is {np.rad2deg(off[joint]):.2f} deg off its path")
 
-    def _too_fast(self, q: Array, velocity: Array) -> DeviceError | None:
-        fastest = self._bounds.fastest
-        if fastest is None:
+    def _too_fast(self, state: RobotState) -> DeviceError | None:
+        """By the mean over a while: arms that follow a stream of points swing about its speed."""
+        fastest, before = self._bounds.fastest, self._feedback[self._moving.name].earlier(state.time - SPEED_OVER)
+        if fastest is None or before is None:
             return None
         factor, slack = SPEED_SLACK
-        speed = self._bounds.speed(q, velocity)
+        speed = self._bounds.speed(before.positions, state.positions, state.time - before.time)
         if speed <= factor * fastest + slack:
             return None
         return self._failed(f"it moves at {speed * 1e3:.0f} mm/s, and {fastest * 1e3:.0f} mm/s is the most it may")
@@ -155,12 +161,20 @@ class _Feedback:
         self.newest: RobotState | None = None
         self._arrived = now
         self._period = 0.0
+        self._past: deque[RobotState] = deque()
 
     def arrived(self, state: RobotState) -> None:
         if self.newest is not None:
             interval = state.time - self.newest.time
             self._period = interval if not self._period else self._period + _PERIOD_SHARE * (interval - self._period)
         self.newest, self._arrived = state, state.time
+        self._past.append(state)
+        while self._past[0].time < state.time - _REMEMBERED:
+            self._past.popleft()
+
+    def earlier(self, time: float) -> RobotState | None:
+        """The latest state that is no later than ``time``, None if there is none."""
+        return next((state for state in reversed(tuple(self._past)) if state.time <= time), None)
 
     def wrong(self, arm: str, now: float) -> DeviceError | None:
         age, allowed = now - self._arrived, max(LEAST_FEEDBACK_AGE, FEEDBACK_PERIODS * self._period)

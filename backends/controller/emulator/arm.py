@@ -82,6 +82,12 @@ class EmulatedArm:
         """Whether it has not come to rest, or has just done so."""
         return self._moving
 
+    @property
+    def rests_since(self) -> float | None:
+        """When it came to rest, None while it has not; -inf if it has never moved."""
+        rested = self._rested
+        return None if rested is None else self._world.begin + rested
+
     def commanded(self) -> Array:
         """(n,) rad: where it was told to be by now; where it is to rest, once it has been told no more."""
         with self._world.lock:

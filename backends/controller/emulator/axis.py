@@ -119,6 +119,11 @@ class Axis:
         """Seconds from one set point of a cyclic mode to the next, as it was told."""
         return float(self._values[0x60C2, 1] * 10.0 ** self._values[0x60C2, 2])
 
+    @property
+    def told(self) -> tuple[int, int]:
+        """The controlword and the target that came last."""
+        return self._controlword, self._values[0x607A, 0]
+
     # What a master reads
 
     def statusword(self) -> int:

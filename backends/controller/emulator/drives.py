@@ -10,6 +10,7 @@ import numpy as np
 from canopen import Network
 
 from backends.controller.emulator.axis import Axis
+from backends.controller.emulator.braking import Braking
 from backends.controller.emulator.drive import Drive, Ill
 from backends.controller.emulator.hub import TICK, Bus, Hub
 from backends.controller.joint_map import JointMap
@@ -84,7 +85,8 @@ class _Wires(Network):
 class ArmDrives:
     """All drives of one arm. A SYNC is done for all of them at once: one reading, their frames, one command.
 
-    on_target: called, on the hub's thread, when the arm is sent somewhere else than before.
+    on_target: called, on the hub's thread, when the arm is sent somewhere else than before. on_stop: when it is seen
+    that it is being stopped, with the time since when.
     Used on the hub's thread only.
     """
 
@@ -107,7 +109,9 @@ class ArmDrives:
         for axis in self._axes:
             axis.hold()
         self._told = self._demands()
+        self._braking = Braking()
         self.on_target: Callable[[], None] = lambda: None
+        self.on_stop: Callable[[float], None] = lambda since: None
         bus.attach(self.on_frame)
 
     def on_frame(self, can_id: int, data: bytes) -> None:
@@ -155,6 +159,8 @@ class ArmDrives:
         for drive in self.drives:
             drive.on_sync(now)
         self._command(next((axis.period for axis in self._axes if axis.is_cyclic), TICK))
+        if (since := self._braking.look(now, [axis.told for axis in self._axes])) is not None:
+            self.on_stop(since)
 
     def _on_nmt(self, data: bytes) -> None:
         if len(data) >= 2:

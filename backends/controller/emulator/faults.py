@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -120,6 +121,8 @@ class FaultSchedule:
         self._hit: dict[tuple[str, str], list[Callable[[], Undo | None]]] = {}
         self._counts: dict[tuple[str, str | None], int] = {}
         self._handles: list[Handle] = []
+        self._came = math.inf
+        self._told: set[str] = set()
         self._closed = False
 
     def attach(self, name: str, arm: str, begin: Callable[[], Undo | None]) -> None:
@@ -147,6 +150,15 @@ class FaultSchedule:
         """A trajectory point of that arm has come."""
         for fault in self._counted("point", arm):
             self._come(fault, arm)
+
+    def stopped(self, arm: str, when: float | None = None) -> None:
+        """That arm was told to stop, at ``when`` by the clock if not now; the first time after a fault it is said."""
+        with self._lock:
+            when = self._clock.now() if when is None else when
+            if when < self._came or arm in self._told:
+                return
+            self._told.add(arm)
+        self._say(f"stop: {arm} is told to, {when:.6f} s of the clock")
 
     def close(self) -> None:
         """No more comes."""
@@ -183,7 +195,8 @@ class FaultSchedule:
         with self._lock:
             if self._closed:
                 return
-        now = self._clock.now()
+            now = self._came = self._clock.now()
+            self._told = set()
         undo = [back for begin in self._of(fault, mover) if (back := begin()) is not None]
         self._say(f"fault: {fault}, at {fault.when}, {now:.6f} s of the clock")
         if fault.seconds is None or not undo:

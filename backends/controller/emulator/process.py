@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -71,6 +72,9 @@ class Emulator:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         distances = self._world.distances()
+        if self._faults:
+            for arm in self._world.arms.values():
+                self._say(f"{arm.name}: {_rest(arm.rests_since)}")
         self._opened.close()
         if distances.times:
             self._say(f"least distance between the arms {distances.least()}")
@@ -101,9 +105,10 @@ class Emulator:
             opening.callback(buses.close)
             for arm in arms:
                 buses.arms[arm].on_target = partial(schedule.pointed, arm)
+                buses.arms[arm].on_stop = partial(schedule.stopped, arm)
                 world.on_contact(_struck(buses, arm))
-                for fault in FAULTS:
-                    schedule.attach(fault, arm, partial(buses.strike, fault, arm))
+                for each in FAULTS:
+                    schedule.attach(each, arm, partial(buses.strike, each, arm))
             self.endpoints[name] = {"can": buses.endpoints}
 
     def _film(self, name: str, opening: ExitStack) -> None:
@@ -158,6 +163,12 @@ def _port(options: CanLink) -> int:
     if len(ports) != 1:
         raise UsageError(f"an emulator serves all buses at one port, and the cell file names {sorted(ports)}")
     return ports.pop()
+
+
+def _rest(since: float | None) -> str:
+    if since is None:
+        return "moves"
+    return f"rests since {since:.6f} s of the clock" if math.isfinite(since) else "has never moved"
 
 
 def _struck(buses: DriveBuses, arm: str) -> Callable[[str], None]:

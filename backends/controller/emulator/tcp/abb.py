@@ -88,6 +88,7 @@ class AbbServer(Server):
 
     def _take(self, point: Point) -> None:
         if point.sequence == STOP:
+            self.told_to_stop()
             self._points = []
             self._halt()
             return

@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 
 from backends.controller.emulator.faults import FaultSchedule
 from backends.controller.emulator.tcp.controller import Controller, ServedArm
 from backends.controller.emulator.tcp.own_speed import OwnSpeed
-from backends.controller.emulator.tcp.packets import FAILURE, REPLY, STOP, SUCCESS, NotAMessage, Packing, Point
+from backends.controller.emulator.tcp.packets import (
+    FAILURE,
+    PREFIX,
+    REPLY,
+    STOP,
+    SUCCESS,
+    NotAMessage,
+    Packing,
+    Point,
+)
 from backends.controller.emulator.tcp.paths import RunOn
 from backends.controller.emulator.tcp.server import Server, is_reachable
 from backends.controller.emulator.tcp.wires import Connection, Line
@@ -38,6 +48,7 @@ class FanucServer(Server):
         message = self._packing.message(data)
         point = self._packing.point(message.body)
         if point.sequence == STOP:
+            self.told_to_stop()
             self._path = None
             self.controller.halt()
             await self._acknowledge(connection, point, SUCCESS)
@@ -45,6 +56,16 @@ class FanucServer(Server):
             self.pointed(self._served)
             await self._acknowledge(connection, point, SUCCESS)
             await self._execute(connection, point)
+
+    async def _wait(self, connection: Connection) -> None:
+        """A stop that comes meanwhile is seen, and not read."""
+        await asyncio.sleep(_LOOK)
+        data = connection.waiting()
+        with suppress(NotAMessage):
+            if len(data) >= PREFIX:
+                last = self._packing.message(data[-self.length(data) :])
+                if self._packing.point(last.body).sequence == STOP:
+                    self.told_to_stop()
 
     def joint_state(self, group: int, served: ServedArm) -> bytes:
         return self._packing.joint_position(served.state()[0])
@@ -59,7 +80,7 @@ class FanucServer(Server):
             await self._acknowledge(connection, point, FAILURE)
             raise NotAMessage("a point out of reach")
         while not self.controller.motion_possible:
-            await asyncio.sleep(_LOOK)
+            await self._wait(connection)
         arm = self._served.arm
         with arm.lock:
             path, t = self._path, arm.clock.now() - self._began
@@ -69,6 +90,6 @@ class FanucServer(Server):
             if t == 0.0:
                 self._path, self._began = path, arm.follow(path)
         while arm.clock.now() < self._began + ready and self.controller.motion_possible:
-            await asyncio.sleep(_LOOK)
+            await self._wait(connection)
         if not self.controller.motion_possible:
             self._path = None

@@ -124,6 +124,7 @@ class MotomanServer(Server):
         if command.command in (_STOP_TRAJECTORY_MODE, _DISCONNECT) and controller.in_motion:
             return FAILED, 0
         if command.command in (_STOP_MOTION, _STOP_SERVOS):
+            self.told_to_stop()
             self._halt()
         if command.command in (_STOP_SERVOS, _STOP_TRAJECTORY_MODE, _DISCONNECT):
             controller.ready = False

@@ -65,6 +65,7 @@ class RepServer(Server):
     def _take(self, point: Point) -> bool:
         if point.sequence < 0:
             if point.sequence == STOP:
+                self.told_to_stop()
                 self._halt()
             return True
         self.pointed(self._served)

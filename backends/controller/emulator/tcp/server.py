@@ -96,6 +96,11 @@ class Server(ABC):
         """A trajectory point came."""
         self._schedule.pointed(served.name)
 
+    def told_to_stop(self) -> None:
+        """A stop came, which is one for all arms of a controller."""
+        for served in self.controller.arms.values():
+            self._schedule.stopped(served.name)
+
 
 def is_reachable(served: ServedArm, place: Array) -> bool:
     """Whether joint angles (n,) are numbers within the limits."""

@@ -110,6 +110,13 @@ class Connection:
             data += b"" if self.dead else piece
         return data
 
+    def waiting(self) -> bytes:
+        """What has come and was not received yet."""
+        try:
+            return self._socket.recv(_MOST, socket.MSG_PEEK)
+        except OSError:
+            return b""
+
     async def send(self, data: bytes) -> None:
         if not self.dead:
             await self._loop.sock_sendall(self._socket, data)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 FAULTS = {
     "drop": "a reply is not sent (TCP)",
-    "delay": "replies come late, by 1 s (TCP)",
+    "delay": "replies wait until this ends (TCP)",
     "split": "messages come in two pieces (TCP)",
     "merge": "two messages come in one piece (TCP)",
     "corrupt": "bytes of a state are overwritten (TCP)",
@@ -35,7 +35,7 @@ FAULTS = {
 }
 """Names and what they do."""
 
-LASTING = {"lost-link": 3.0}
+LASTING = {"lost-link": 3.0, "delay": 1.2}
 """Seconds that a fault lasts where nothing else is asked for; others last, or strike once."""
 
 GRAMMAR = "NAME[:ARM]@WHEN[~SECONDS]"

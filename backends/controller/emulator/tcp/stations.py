@@ -104,7 +104,7 @@ class Station:
 
         befall: dict[str, Callable[[], Undo | None]] = {
             "drop": act(line.drop_one),
-            "delay": act(line.delay_one),
+            "delay": act(line.delay, line.go_on),
             "split": flag("splitting"),
             "merge": flag("merging"),
             "corrupt": act(line.corrupt_one),

@@ -8,9 +8,6 @@ import struct
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 
-LATE = 1.0
-"""Seconds that a delayed reply takes."""
-
 _APART = 0.03  # s between two pieces of a message
 _MOST = 4096  # bytes that are received at once
 
@@ -21,7 +18,8 @@ class Line:
     """What is wrong with one arm's connections now; on the servers' thread only."""
 
     def __init__(self) -> None:
-        self._drops = self._delays = self._corrupts = 0
+        self._drops = self._corrupts = 0
+        self._prompt: asyncio.Event | None = None  # what replies wait for, if anything
         self.splitting = self.merging = self.stale = False
         self.ports: list[Port] = []
         self._held: dict[Connection, bytes] = {}
@@ -30,9 +28,15 @@ class Line:
         """The next reply is not sent."""
         self._drops += 1
 
-    def delay_one(self) -> None:
-        """The next reply is late."""
-        self._delays += 1
+    def delay(self) -> None:
+        """Replies wait."""
+        self._prompt = self._prompt or asyncio.Event()
+
+    def go_on(self) -> None:
+        """They wait no more."""
+        if self._prompt is not None:
+            self._prompt.set()
+            self._prompt = None
 
     def corrupt_one(self) -> None:
         """The next state begins with nonsense."""
@@ -59,9 +63,8 @@ class Line:
         if self._drops:
             self._drops -= 1
             return
-        if self._delays:
-            self._delays -= 1
-            await asyncio.sleep(LATE)
+        if self._prompt is not None:
+            await self._prompt.wait()
         await self._send(connection, data)
 
     async def state(self, connection: Connection, data: bytes) -> None:

@@ -92,7 +92,7 @@ class Watch:
     def _run(self) -> None:
         try:
             while not self._ended:
-                error = self._failure or self._look()
+                error = self._failure or self._look_safely()
                 if error is not None and not self._ended:
                     self._alarm(error)
                     return
@@ -100,6 +100,15 @@ class Watch:
         finally:
             for leave in self._leave:
                 leave()
+
+    def _look_safely(self) -> DeviceError | None:
+        """What cannot be looked at must not go on."""
+        try:
+            return self._look()
+        except Exception as failed:  # noqa: BLE001 - an arm would move on, watched by nobody
+            error = self._failed(f"this program could not look at it: {failed!r}")
+            error.__cause__ = failed
+            return error
 
     def _look(self) -> DeviceError | None:
         for robot in (self._moving, self._other):

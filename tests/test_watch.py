@@ -169,6 +169,19 @@ def test_the_arm_that_is_to_stand_must_not_move(rig):
     assert cell.links["right"].stops
 
 
+def test_an_arm_that_cannot_be_looked_at_is_stopped(rig, monkeypatch):
+    def fail(waypoints, q):
+        raise ZeroDivisionError("of this program")
+
+    cell = rig()
+    monkeypatch.setattr("dualcal_hal.watch.off_path", fail)
+    motion = cell.start("left", ASIDE)
+    with pytest.raises(MotionFailed, match=r"left: move: this program could not look at it: ZeroDivisionError"):
+        motion.wait(AMPLE)
+    assert cell.links["left"].stops
+    assert cell.links["right"].stops
+
+
 def test_a_controller_with_a_speed_of_its_own_moves_under_a_limit_only_once_that_is_confirmed(rig):
     for own, words in ((OwnSpeed(None), "nobody has confirmed"), (OwnSpeed(0.3), "300 mm/s are confirmed")):
         cell = rig(pace=Pace(largest=REDUCED_SPEED), own_speed=own)

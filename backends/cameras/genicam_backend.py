@@ -12,8 +12,8 @@ from pydantic import BaseModel, Field
 from backends.cameras.backend import CAMERA, CameraBackend, require_extra
 from backends.cameras.driver import Driver
 from backends.cameras.features import Features, translated
-from backends.cameras.files import BesideTheCellFile
 from backends.cameras.genicam_driver import PIXELS, Asking, GenicamDriver, OwnAcquisition, SoftwareTrigger
+from dualcal_hal.config.files import BesideTheCellFile
 from dualcal_hal.config.values import Number, Positive, Section
 from dualcal_hal.errors import LinkLost, UnknownDevice
 from dualcal_hal.findings import Finding

@@ -12,9 +12,9 @@ from pydantic import BaseModel, Field, model_validator
 from backends.cameras.backend import CAMERA, CameraBackend
 from backends.cameras.capture import CaptureStream, Connection
 from backends.cameras.driver import Driver
-from backends.cameras.files import BesideTheCellFile
 from backends.cameras.folder import Folder
 from backends.cameras.video import open_device, open_url
+from dualcal_hal.config.files import BesideTheCellFile
 from dualcal_hal.config.values import Natural, NotNegative, Positive, Section
 
 

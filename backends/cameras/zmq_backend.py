@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, Field, model_validator
 from backends.cameras.backend import CAMERA, CameraBackend, require_extra
 from backends.cameras.curve import ClientKeys, host_of, is_loopback
 from backends.cameras.driver import Driver
-from backends.cameras.files import BesideTheCellFile
+from dualcal_hal.config.files import BesideTheCellFile
 from dualcal_hal.config.values import Section
 from dualcal_hal.errors import UsageError
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from backends.controller.joint_map import JointMapConfig
+from dualcal_hal.config.files import BesideTheCellFile
 from dualcal_hal.config.values import AtLeast1, NotNegative, Number, Positive, Section
 
 Port = Annotated[AtLeast1, Field(le=65535)]
@@ -122,7 +123,7 @@ class Drive(Section):
     """What the joint stands at where the drive shows 0 counts, rad."""
     sign: Literal[-1, 1] = 1
     """-1 where the drive counts against the joint."""
-    eds: str | None = None
+    eds: BesideTheCellFile | None = None
     """The drive's electronic data sheet (EDS), for its names and versions; found without it."""
 
 

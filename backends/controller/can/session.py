@@ -478,7 +478,7 @@ class CanArmLink(ArmLink):
         for axis, record, drive in zip(self._axes, records, self._drives, strict=True):
             found += drive_findings(axis, record)
             if drive.eds is not None:
-                found += eds_findings(axis, record, drive.eds)
+                found += eds_findings(axis, record, str(drive.eds))
         return found + cycle_findings(cycle.statistics.report(), self._period, cycle.prompt)
 
 

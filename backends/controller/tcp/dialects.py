@@ -77,11 +77,13 @@ class Dialect(ABC):
     """A server's ways. ``group`` is the arm's, where messages carry one.
 
     acknowledges_within: s in which a reply comes. downloads: whether nothing moves before all points are there.
-    pings: whether the motion port takes a PING. switches: whether drives and faults can be reached by messages.
+    begins_within: s in which the arm begins to move once all points are taken. pings: whether the motion port takes a
+    PING. switches: whether drives and faults can be reached by messages.
     """
 
     acknowledges_within: ClassVar[float] = 1.0
     downloads: ClassVar[bool] = False
+    begins_within: ClassVar[float] = 0.1
     pings: ClassVar[bool] = False
     switches: ClassVar[bool] = False
 
@@ -180,6 +182,7 @@ class Fanuc(_PointByPoint):
 class Abb(Dialect):
     """Takes all points before it moves, and blends the corners; it has room for so many."""
 
+    begins_within = 0.5
     downloads = True
 
     def __init__(self, top_speed: Joints, room: int) -> None:

@@ -57,6 +57,7 @@ class SimpleMessageArm(ArmLink):
         self._controller = controller
         self._feedback = feedback
         self._dialect = controller.dialect
+        self.begins_within = self._dialect.begins_within
         self._clock = clock
         self._lock = threading.Lock()
         self._handover: HandOver | None = None

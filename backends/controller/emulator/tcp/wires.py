@@ -125,8 +125,9 @@ class Connection:
             await self._loop.sock_sendall(self._socket, data)
 
     def breaks(self) -> None:
-        """Have its end be an error to the client."""
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        """Have its end be an error to the client, if it has not ended yet."""
+        with suppress(OSError):
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
     def close(self) -> None:
         self._socket.close()

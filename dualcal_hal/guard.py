@@ -250,6 +250,9 @@ class GuardedRobot(Robot):
     def subscribe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
         return self._robot.subscribe(function)
 
+    def observe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
+        return self._robot.observe(function)
+
     def on_failure(self, function: Callable[[DeviceError], None]) -> Callable[[], None]:
         return self._robot.on_failure(function)
 

@@ -181,6 +181,10 @@ class Robot(ABC):
     def subscribe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
         """Hand each state to ``function`` as it arrives, on the device's thread; returns what ends that."""
 
+    def observe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
+        """As :meth:`subscribe`, for those who look after the arm and ask it nothing: it is recorded as no call."""
+        return self.subscribe(function)
+
     def on_failure(self, function: Callable[[DeviceError], None]) -> Callable[[], None]:
         """Tell ``function`` at once when the arm's link or drives fail, on the device's thread; returns what ends that.
 

@@ -75,7 +75,7 @@ class Watch:
         self._leave = [
             leave
             for robot in (moving, bounds.other)
-            for leave in (robot.subscribe(self._feedback[robot.name].arrived), robot.on_failure(self._on_failure))
+            for leave in (robot.observe(self._feedback[robot.name].arrived), robot.on_failure(self._on_failure))
         ]
         self._thread = threading.Thread(target=self._run, name=f"watch {moving.name}", daemon=True)
         self._thread.start()

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 from backends.controller.joint_map import JointMap
 from backends.controller.link import ArmLink
 from backends.controller.options import ControllerOptions, Link
+from backends.controller.promptness import spare_the_heap
 from backends.controller.robot import ControlledRobot, OwnSpeed
 from dualcal_hal.backend import Backend
 from dualcal_hal.camera import Camera
@@ -73,6 +74,7 @@ class ControllerBackend(Backend):
                 if_it_fails.callback(self._robots[arm].detach)
                 self._robots[arm].attach(link)
             self._open = if_it_fails.pop_all()
+        spare_the_heap()
 
     def close(self) -> None:
         opened, self._open = self._open, None

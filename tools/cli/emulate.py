@@ -15,7 +15,7 @@ from types import FrameType
 import typer
 
 from backends.controller.emulator.process import FORMAT, Emulator
-from backends.controller.promptness import go_before_others
+from backends.controller.promptness import go_before_others, spare_the_heap
 from dualcal_hal.errors import DeviceError
 from tools.cli.terminal import plain
 
@@ -53,6 +53,7 @@ def emulate(options: EmulateOptions) -> None:
         failed=ended.put,
     )
     with emulator:
+        spare_the_heap()
         document = {"format": FORMAT, "pid": os.getpid(), "backends": emulator.endpoints}
         typer.echo(json.dumps(document))
         sys.stdout.flush()

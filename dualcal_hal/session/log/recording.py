@@ -251,6 +251,9 @@ class _RecordedRobot(Robot):
 
         return _answered(recording, name, index, lambda: self._robot.subscribe(arrived), lambda _: None)
 
+    def observe(self, function: Callable[[RobotState], None]) -> Callable[[], None]:
+        return self._robot.observe(function)
+
     def on_failure(self, function: Callable[[DeviceError], None]) -> Callable[[], None]:
         """Not recorded: what comes of it is, a stop or an error."""
         return self._robot.on_failure(function)

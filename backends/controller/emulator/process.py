@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 FORMAT = "dualcal.emulator/1"
 
 _LOOPBACK = "127.0.0.1"
+
+_REST_WITHIN = 3.0  # s after the end within which an arm is to stand
+_LOOK = 0.02  # s from one look whether it does to the next
 
 
 class Emulator:
@@ -73,11 +77,19 @@ class Emulator:
     ) -> None:
         distances = self._world.distances()
         if self._faults:
-            for arm in self._world.arms.values():
-                self._say(f"{arm.name}: {_rest(arm.rests_since)}")
+            self._tell_of_rest()
         self._opened.close()
         if distances.times:
             self._say(f"least distance between the arms {distances.least()}")
+
+    def _tell_of_rest(self) -> None:
+        """Whether arms that had a fault come to rest, also when nobody is there any more who stops them."""
+        clock, arms = self._world.clock, self._world.arms.values()
+        end, never = clock.now() + _REST_WITHIN, threading.Event()
+        while clock.now() < end and any(arm.rests_since is None for arm in arms):
+            clock.wait(never, clock.now() + _LOOK)
+        for arm in arms:
+            self._say(f"{arm.name}: {_rest(arm.rests_since)}")
 
     def _serve(self, name: str, options: ControllerOptions, schedule: FaultSchedule, opening: ExitStack) -> None:
         cell, world = self._file.cell, self._world

@@ -193,6 +193,70 @@ def test_a_stop_is_confirmed_by_a_newer_state(robot):
         motion.wait(AMPLE)
 
 
+@pytest.fixture
+def stopped_meanwhile(robot, link, monkeypatch):
+    """Has another thread stop the arm as its link is asked for something by this one, which then goes on."""
+
+    def arrange(name):
+        asked, stopping = getattr(link, name), threading.Thread(target=robot.stop, args=("enough",))
+        told, stop = threading.Event(), link.stop
+
+        def tell(reason):
+            stop(reason)
+            told.set()
+
+        def ask(*args):
+            if stopping.ident is None:
+                stopping.start()
+                assert told.wait(AMPLE)
+            return asked(*args)
+
+        monkeypatch.setattr(link, "stop", tell)
+        monkeypatch.setattr(link, name, ask)
+        threads.append(stopping)
+
+    threads = []
+    yield arrange
+    for thread in threads:
+        thread.join()
+
+
+def test_what_is_stopped_before_it_has_begun_is_not_sent(robot, link, stopped_meanwhile):
+    stopped_meanwhile("report_after")
+    with pytest.raises(MotionStopped, match="enough"):
+        robot.start(path((1.0, 0.0, 0.0))).wait(AMPLE)
+    assert not link.courses
+
+
+def test_a_stop_that_comes_before_the_course_that_is_just_sent_stops_that(robot, link, stopped_meanwhile):
+    stopped_meanwhile("send")
+    with pytest.raises(MotionStopped, match="enough"):
+        robot.start(path((1.0, 0.0, 0.0))).wait(AMPLE)
+    assert link.courses
+    assert link.stops[1:] == ["it was stopped as it began"]
+
+
+def test_a_failure_as_a_course_is_sent_stops_that(robot, link, monkeypatch):
+    send = link.send
+
+    def failing(course):
+        link.fail(LinkLost("left", "receive", "the bus is gone"))
+        return send(course)
+
+    monkeypatch.setattr(link, "send", failing)
+    with pytest.raises(LinkLost, match="the bus is gone"):
+        robot.start(path((1.0, 0.0, 0.0))).wait(AMPLE)
+    assert link.stops == ["the bus is gone", "it was stopped as it began"]
+
+
+def test_the_error_that_ends_a_motion_is_not_the_stop_that_it_brings_about(robot, link):
+    link.takes_all = False  # so that the stop ends the transfer
+    motion = robot.start(path((1.0, 0.0, 0.0)))
+    link.fail(LinkLost("left", "receive", "the bus is gone"))
+    with pytest.raises(LinkLost, match="the bus is gone"):
+        motion.wait(AMPLE)
+
+
 def test_a_stop_is_sent_also_where_nothing_moves(robot, link):
     assert robot.stop("to be sure").confirmed
     assert link.stops == ["to be sure"]

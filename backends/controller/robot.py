@@ -99,7 +99,10 @@ class ControlledRobot(Robot):
         return _added(self._failures, function)
 
     def start(self, path: JointPath) -> Motion:
-        """Hand the path over, once a report asked for now says that the arm is ready and stands."""
+        """Hand the path over, once a report asked for now says that the arm is ready and stands.
+
+        What is stopped meanwhile does not begin, or is stopped as it begins.
+        """
         link = self._opened("move")
         if (why := self._limits.objection(path)) is not None:
             raise CommandRefused(self.name, "move", why, "check the path")
@@ -114,9 +117,13 @@ class ControlledRobot(Robot):
             self._refuse_unless_ready(report)
             start = self._map.from_controller(np.array(report.positions))
             course = Course(start, path, self._map)
+            if following.stopped:
+                return motion  # while it waited for the report
             transfer = link.send(course)
             following.begin(course, transfer)
             transfer.on_end(lambda: self._on_transfer(following, transfer))
+            if following.stopped:
+                link.stop("it was stopped as it began")  # the one before may have come before the course
         except DeviceError as error:
             self._ended(following)
             following.fail(error)
@@ -199,6 +206,7 @@ class ControlledRobot(Robot):
 
     def _end_by(self, following: Following, error: DeviceError) -> None:
         """Stop the arm, first of all, and end its motion by the error."""
+        following.stopping()
         link = self._link
         if link is not None:
             try:

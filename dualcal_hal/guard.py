@@ -41,8 +41,11 @@ So a plan that kept the whole of it, for the same placement, is not refused.
 READING_SLACK = 0.001
 """m by which clearance may seem to fall because joints are read, not known."""
 
-LARGEST_STEP = 2 * np.pi
+LARGEST_STEP = 4 * np.pi
 """rad that no joint turns by from one waypoint to the next: more is a mistake, of units or of where the arm stands."""
+
+LEFT_WITHIN = 0.02
+"""rad that an arm may stand from where its last motion has settled: farther off somebody has moved it."""
 
 WATCH_SLACK = 0.010
 """m by which clearance may be less than anywhere on the path while the arm moves: readings are late and scatter."""
@@ -283,6 +286,11 @@ class GuardedRobot(Robot):
         if state.mode is not Mode.READY or state.faults:
             what = ", ".join([f"mode '{state.mode}'", *state.faults])
             raise CommandRefused(self.name, "move", f"the arm is not ready: {what}", "clear it at the controller")
+        left_at = None if self._motion is None else self._motion.final
+        away = 0.0 if left_at is None else float(np.max(np.abs(np.subtract(state.positions, left_at.positions))))
+        if away > LEFT_WITHIN:
+            why = f"it stands {np.rad2deg(away):.2f} deg from where its last motion has ended"
+            raise CommandRefused(self.name, "move", why, "nothing was sent; find out what moved it, and run anew")
         steps = np.abs(np.diff([state.positions, *path.waypoints], axis=0))
         if np.max(steps) > LARGEST_STEP:
             joint = int(np.unravel_index(np.argmax(steps), steps.shape)[1])

@@ -337,3 +337,18 @@ def test_an_arm_that_may_be_touching_the_other_for_an_error_of_the_bases_is_jogg
     with pytest.raises(CommandRefused, match="jog"):
         move(passive, CONFIG.passive, bent(-0.3))
     assert device.sent == []
+
+
+def test_an_arm_that_somebody_moved_since_its_last_motion_is_not_moved_from_there(guarded, device):
+    guarded.start(path((0.2, 0.0))).settle(device.read(1.0))
+    device.positions = (device.positions[0] + 0.1, device.positions[1])
+    with pytest.raises(CommandRefused, match=r"stands 5\.73 deg from where its last motion has ended"):
+        guarded.start(path((0.3, 0.0)))
+
+
+def test_a_turn_that_no_arm_needs_is_refused(device):
+    wide = JointLimits(np.full(2, -20.0), np.full(2, 20.0), LIMITS.speed, LIMITS.acceleration)
+    robot = GuardedRobot(device, wide, device.clock)
+    robot.admit(lambda start, path: None, threading.Lock())
+    with pytest.raises(CommandRefused, match="joint 2 would turn by 745 deg in one step"):
+        robot.start(path((0.0, 13.0)))

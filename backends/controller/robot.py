@@ -67,6 +67,7 @@ class ControlledRobot(Robot):
             following, self._following = self._following, None
             self._states, self._failures = [], []
         if link is not None and following is not None:
+            following.stopping()
             with suppress(DeviceError):  # closing the link stops the arm, too
                 link.stop("its backend is closed")
             following.motion.stop("its backend was closed")

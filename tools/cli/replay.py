@@ -40,7 +40,7 @@ from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.intrinsics import replay_intrinsics
 from tools.cli.run import analyse_session, execute, write_session_captures
 from tools.cli.terminal import Screen
-from tools.cli.truth import simulated_truth
+from tools.cli.truth import told_truth
 
 _NO_END_OF_A_RUN = (ReplayMismatch, FrameMissing, LogDamaged, Interrupted)
 """Errors that say that the replay failed, and not that the recorded run ended so."""
@@ -109,11 +109,6 @@ def _load(session: Path) -> CellFile:
     return load_cell(path, instead={"type": "replay", "session": str(session.absolute())})
 
 
-def _as_recorded(session: Path) -> CellFile:
-    """The session's cell as it was run, whether or not its backends are installed here."""
-    return load_cell(session / "cell.yaml", meshes=False, backends=False)
-
-
 class _PassingSession(Session):
     """A session whose folder is thrown away: nobody will look at its images."""
 
@@ -143,7 +138,8 @@ def _replay(recorded: Path, file: CellFile, session: Session) -> Replayed:
         with signals_deferred() as signals:
             execute(cell, calibration, session, lambda event: None, lambda engine: signals.pass_on_to(engine.abort))
         captures = write_session_captures(file, session)
-        analyse_session(file, session, captures, simulated_truth(_as_recorded(recorded), recorded))
+        compared = expected is not None and expected.truth_error is not None
+        analyse_session(file, session, captures, told_truth(file) if compared else None)
         # Read as the recorded one is: what is compared is what the files say.
         result = read_result(session.result_path)
     except _NO_END_OF_A_RUN:

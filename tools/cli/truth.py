@@ -22,6 +22,13 @@ def simulated_truth(file: CellFile, session: Path) -> Mapping[str, Array] | None
     """
     if file.simulation is None or not (_is_simulated(file) or read_conduct(Session(session)).emulated):
         return None
+    return told_truth(file)
+
+
+def told_truth(file: CellFile) -> Mapping[str, Array] | None:
+    """The true transforms that a cell file tells, None if it tells none; whoever asks knows that it was simulated."""
+    if file.simulation is None:
+        return None
     return {T_P_A_NAME: file.simulation.truth.T_P_A, T_H_E_NAME: file.simulation.truth.T_H_E}
 
 

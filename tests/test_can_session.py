@@ -166,6 +166,23 @@ def test_mapping_is_written_while_the_pdo_is_off(arm, bus):
     assert writes[-1] == (0x1400, 0x201)
 
 
+def test_a_pdo_that_is_not_sent_on_request_stays_so(arm, bus, monkeypatch):
+    not_on_request, request = 1 << 30, bus._request
+    for drive in bus.drives.values():
+        drive.objects[0x1800, 1] = (not_on_request | 0x180 + drive.node).to_bytes(4, "little")
+
+    def strict(drive, data):
+        written = int.from_bytes(data[4:], "little")
+        if data[0] & 0xE0 == 0x20 and data[1:4] == b"\x00\x18\x01" and not written & not_on_request:
+            bus.send(0x580 + drive.node, b"\x80" + data[1:4] + (0x06090030).to_bytes(4, "little"))
+        else:
+            request(drive, data)
+
+    monkeypatch.setattr(bus, "_request", strict)
+    arm.open()
+    assert bus.drives[2].number(0x1800, 1) == not_on_request | 0x182
+
+
 def test_drives_that_do_not_answer_are_all_named(arm, bus):
     bus.drives[1].dead = bus.drives[5].dead = True
     with pytest.raises(DeviceTimeout, match=r"joint 1 \(node 1\), joint 3 \(node 5\)"):
@@ -280,7 +297,7 @@ def test_a_drive_that_does_not_come_to_be_enabled_is_named_and_the_others_are_sw
 def test_a_fault_is_not_enabled_but_reset_first_and_stays_off_then(enabled, bus):
     bus.fail(2, 0x8611)
     enabled.failure(DeviceError, "0x8611")
-    with pytest.raises(CommandRefused, match=r"joint 2 \(node 2\) in fault"):
+    with pytest.raises(CommandRefused, match=r"in fault: joint 2 \(node 2\)"):
         enabled.link.enable(PATIENCE)
     assert bus.drives[2].state == FAULT
     enabled.link.reset_fault(PATIENCE)
@@ -537,6 +554,21 @@ def test_a_reboot_is_told_and_the_arm_set_up_anew_but_not_enabled(enabled, bus):
     assert bus.drives[5].nmt == 0x05
     enabled.link.enable(PATIENCE)
     assert enabled.ended(enabled.move((0.0, 0.0, 0.0))).complete
+
+
+def test_a_drive_that_starts_itself_after_a_reboot_is_not_enabled_before_it_was_set_up_anew(enabled, bus):
+    enabled.report_that(lambda report: report.mode is Mode.READY)
+    with bus.lock:
+        bus.reboot(5)
+        bus.drives[5].nmt = 0x05
+        bus.drives[5].objects[0x1017, 0] = (100).to_bytes(2, "little")
+    enabled.failure(DeviceError, "joint 3 (node 5)", "rebooted")
+    with pytest.raises(CommandRefused, match=r"joint 3 \(node 5\): has rebooted"):
+        enabled.link.enable(PATIENCE)
+    enabled.failure(LinkLost, "joint 3 (node 5)", "set up anew")
+    enabled.report_that(lambda report: report.mode is Mode.DISABLED)
+    assert bus.drives[5].number(0x1016, 1) & 0xFFFF == 500
+    enabled.link.enable(PATIENCE)
 
 
 def test_drives_stop_when_this_program_sends_no_more_heartbeats(enabled, bus):

@@ -28,6 +28,7 @@ _CIA_402 = 402
 _QUICK_STOP_AND_STAY = 6  # slow down on the quick stop ramp and hold the position
 _ON_LOSS_QUICK_STOP = 3
 _PDO_OFF = 1 << 31
+_PDO_NOT_ON_REQUEST = 1 << 30
 _EVERY_SYNC = 1
 _RPDO_OBJECTS = (0x60400010, 0x60600008, 0x607A0020)
 _TPDO_OBJECTS = (0x60410010, 0x60610008, 0x60640020)
@@ -138,6 +139,8 @@ def leave(sdo: SdoNode) -> None:
 
 
 def _map_pdo(sdo: SdoNode, parameters: int, mapping: int, identifier: int, objects: tuple[int, ...]) -> None:
+    # Drives that send no PDO when they are asked to by a remote frame refuse to have that bit cleared.
+    identifier |= (_number(sdo, parameters, 1) or 0) & _PDO_NOT_ON_REQUEST
     # CiA 301's order: off, emptied, filled, on.
     sdo.write(parameters, 1, identifier | _PDO_OFF, 4)
     sdo.write(mapping, 0, 0, 1)

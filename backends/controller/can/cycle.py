@@ -152,6 +152,11 @@ class Cycle:
         """Those drives."""
         return [watch.axis.name for watch in self._watch if watch.silent]
 
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What is wrong with the drives, in words."""
+        return tuple(text for watch in self._watch if (text := watch.fault))
+
     def want(self, goal: Goal) -> None:
         """Have each drive led towards ``goal``, a step in each cycle."""
         with self._lock:
@@ -300,16 +305,8 @@ class Cycle:
         heartless = [w for w in self._watch if w.heartless == self._late_heartbeat and w.silent < self._late_feedback]
         self._judge_silence(heartless, "has sent no heartbeat")
         for watch in self._watch:
-            if max(watch.silent, watch.heartless) >= self._lost:
-                what = "answer" if watch.silent >= self._lost else "heartbeat"
-                self.lose(
-                    LinkLost(
-                        self._device,
-                        "receive",
-                        f"no {what} of {watch.axis.name} for {LOST:g} s{watch.hint}",
-                        "check its power and the bus",
-                    )
-                )
+            if (what := watch.missing_for(self._lost)) is not None:
+                self.lose(LinkLost(self._device, "receive", what, "check its power and the bus"))
 
     def _judge_drive(self, watch: _Watch) -> bool:
         """Whether it has left operation enabled, other than by a fault, which is told here."""
@@ -397,7 +394,7 @@ class Cycle:
             rate = 0.0 if stands else (counts[number] - first[number]) / (sync - begin)
             velocities.append(axis.scale.sign * rate / axis.scale.counts_per_rad)
         self._standing = not any(velocities)
-        faults = tuple(text for watch in self._watch if (text := watch.fault))
+        faults = self.faults
         self._on_report(
             ArmReport(
                 positions=tuple(axis.scale.to_angle(count) for axis, count in zip(axes, counts, strict=True)),
@@ -433,6 +430,7 @@ class _Watch:
         self.silent = 0
         self.heartless = 0
         self.rebooted = False
+        self._away = 0
         self.fault_told = axis.state in IN_FAULT
         self._answers = axis.answers
         self._heartbeats = axis.heartbeats
@@ -444,7 +442,19 @@ class _Watch:
         self.silent = self.silent + 1 if answers == self._answers else 0
         self.heartless = self.heartless + 1 if heartbeats == self._heartbeats else 0
         self._answers, self._heartbeats = answers, heartbeats
+        self._away += self.rebooted
         return self.silent == 0
+
+    def missing_for(self, cycles: int) -> str | None:
+        """What so many cycles have been without, in words; None if nothing is missing.
+
+        A drive that starts itself after a reboot answers and sends heartbeats, but is not what it was set up to: it
+        has to be found anew.
+        """
+        if max(self.silent, self.heartless) >= cycles:
+            what = "answer" if self.silent >= cycles else "heartbeat"
+            return f"no {what} of {self.axis.name} for {LOST:g} s{self.hint}"
+        return f"{self.axis.name} has rebooted and is to be set up anew" if self._away >= cycles else None
 
     @property
     def hint(self) -> str:

@@ -19,7 +19,6 @@ from backends.controller.can.notices import Notices
 from backends.controller.can.objects import (
     EMERGENCY,
     HEARTBEAT,
-    IN_FAULT,
     INT32,
     NMT,
     RPDO1,
@@ -398,10 +397,9 @@ class CanArmLink(ArmLink):
     def enable(self, timeout: float) -> None:
         with self._commanding:
             cycle = self._running("enable")
-            faults = [axis.name for axis in self._axes if axis.state in IN_FAULT or axis.emergency is not None]
-            if faults:
-                why = f"{', '.join(faults)} in fault"
-                raise CommandRefused(self.arm, "enable", why, f"dualcal reset ... --arm {self.arm} first")
+            if faults := cycle.faults:
+                why, advice = "; ".join(faults), f"dualcal reset ... --arm {self.arm} first"
+                raise CommandRefused(self.arm, "enable", f"in fault: {why}", advice)
             cycle.forget_emergencies()
             cycle.want(Goal.ON)
             axes = self._axes

@@ -436,6 +436,24 @@ def test_a_stop_halts_them_and_they_do_not_go_on_before_they_are_sent_elsewhere(
     assert bus.drives[1].set_points[-1] == 0
 
 
+def test_what_a_stopped_course_still_asks_of_a_drive_is_nothing_to_the_next_one(profile, bus, monkeypatch):
+    request, unanswered = bus._request, threading.Event()
+
+    def swallow(drive, data):
+        if data[1:3] == b"\x81\x60" and not unanswered.is_set():
+            unanswered.set()
+        else:
+            request(drive, data)
+
+    monkeypatch.setattr(bus, "_request", swallow)
+    first = profile.link.send(profile.course((1.0, 0.0, 0.0)))
+    assert unanswered.wait(PATIENCE)
+    profile.link.stop("enough")
+    assert isinstance(profile.ended(first).error, MotionStopped)
+    assert profile.ended(profile.link.send(profile.course((0.2, 0.0, 0.0)))).complete
+    assert not profile.failures
+
+
 def test_drives_that_do_not_take_their_speeds_do_not_move(profile, bus):
     bus.drives[2].aborts.add(0x6083)
     transfer = profile.link.send(profile.course((0.1, 0.1, 0.0)))

@@ -338,6 +338,8 @@ class CanArmLink(ArmLink):
             return transfer
 
     def _send_waypoints(self, course: Course, cycle: Cycle, transfer: Transfer) -> None:
+        if (before := self._waypoints) is not None:
+            before.join()  # a request of its own that still waits for an answer must not set speeds after ours
         arrival = max(2, round(_ARRIVAL * min(axis.scale.counts_per_rad for axis in self._axes)))
         lead = SetPointLead(cycle.halted, arrival)
         cycle.lead(lead, transfer)
@@ -347,7 +349,8 @@ class CanArmLink(ArmLink):
             try:
                 follow_waypoints(self.arm, course, start, lead, self._axes, self._sdo, self._clock)
             except DeviceError as error:
-                cycle.give_up(error)
+                if not lead.is_over:
+                    cycle.give_up(error)
 
         self._waypoints = threading.Thread(target=follow, name=f"{self.arm} CAN waypoints", daemon=True)
         self._waypoints.start()

@@ -229,6 +229,12 @@ def rep_with_body(server: SmallServer, message: Received) -> bytes | None:
     return server.packet(message.id, 3, 1, "10r", *[math.nan] * 10)
 
 
+def rep_with_an_echo(server: SmallServer, message: Received) -> bytes | None:
+    """The same with the request's own body, as the REP's authors' library replies."""
+    rep(server, message)
+    return server.packet(message.id, 3, 1, f"{len(message.body)}B", *message.body)
+
+
 def abb(server: SmallServer, message: Received) -> bytes | None:
     """Gathers points, and goes when the last one has come."""
     if message.id != 11:

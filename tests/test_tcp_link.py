@@ -38,6 +38,7 @@ from tests.tcp_servers import (
     moto_reply,
     motoman,
     rep,
+    rep_with_an_echo,
     rep_with_body,
 )
 
@@ -399,7 +400,10 @@ def points(server: SmallServer) -> list[tuple[int, list[float], float, float]]:
     return told
 
 
-@pytest.mark.parametrize(("dialect", "answer"), [("rep", rep), ("rep", rep_with_body), ("fanuc", fanuc)])
+STREAMS = [("rep", rep), ("rep", rep_with_body), ("rep", rep_with_an_echo), ("fanuc", fanuc)]
+
+
+@pytest.mark.parametrize(("dialect", "answer"), STREAMS)
 def test_a_stream_is_short_segments_numbered_from_zero(dialect: str, answer: Answer) -> None:
     way = course(0.3, -0.1)
     with arm(dialect, answer) as (link, server):

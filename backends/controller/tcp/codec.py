@@ -239,7 +239,8 @@ KINDS: dict[int, type[Message]] = {
     )
 }
 
-# Replies whose body is ten dummies, or is left out; some servers with f64 have integers for dummies.
+# Replies whose body is ten dummies, that of the request once more, as the peers' library has it, or is left out; some
+# servers with f64 have integers for dummies.
 _DUMMY_REPLIES = {JointTrajPt.ID, JointTrajPtFull.ID, Ping.ID}
 _DUMMY_SIZES = {0, 40, 80}
 _SIGN = {"big": ">", "little": "<"}
@@ -289,7 +290,7 @@ def decode(frame: bytes, wire: Wire) -> Message:
         return Unknown(id=identity, body=body, **header)
     if comm == Comm.REPLY and (code == Code.FAILURE or not body or identity in _DUMMY_REPLIES):
         # A failure's body may be anything, and dummies say nothing.
-        if code == Code.SUCCESS and len(body) not in _DUMMY_SIZES:
+        if code == Code.SUCCESS and len(body) not in (*_DUMMY_SIZES, _layout(kind.BODY, wire).size):
             raise LengthError(f"a reply to {kind.__name__} has no body of {len(body)} bytes")
         return Acknowledgement(id=identity, **header)
     layout = _layout(kind.BODY, wire)

@@ -344,9 +344,12 @@ def test_a_controller_that_sends_no_status_is_not_ready() -> None:
             assert newer(link).mode is Mode.READY
 
 
-def test_a_status_that_comes_no_more_says_nothing_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("unknown_is_ready", [False, True])
+def test_a_status_that_comes_no_more_says_nothing_any_more(
+    unknown_is_ready: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("backends.controller.tcp.feedback.LOST_AFTER", 0.3)
-    with arm("rep") as (link, server):
+    with controller("rep") as server, opened(server, "rep", unknown_is_ready=unknown_is_ready) as link:
         assert newer(link).mode is Mode.READY
         server.tells_status = False
         while newer(link).mode is Mode.READY:

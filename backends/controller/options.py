@@ -56,7 +56,8 @@ class TcpLink(Section):
     controller_speed_confirmed: SpeedConfirmed | None = None
     """The speed set at a controller that ignores the speed it is sent (abb, fanuc)."""
     unknown_is_ready: bool = False
-    """Whether a controller that does not tell its mode, or that a motion is possible, is taken to be ready."""
+    """Whether what a controller cannot tell is taken to be as it has to be: mode, drives, emergency stop, error, motion
+    possible."""
     arms: dict[str, TcpArm]
     """Both arms, by their names under robots."""
 

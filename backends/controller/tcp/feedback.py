@@ -35,6 +35,7 @@ class Feedback:
         self._arm, self._joints, self._group = arm, joints, group
         self._port = port
         self._unknown_is_ready = unknown_is_ready
+        self._tells_status = False
         self._clock = clock
         self._lock = threading.Lock()
         self._open = False
@@ -56,6 +57,7 @@ class Feedback:
         """Nothing is known yet."""
         with self._lock:
             self._open, self._lost, self._report, self.status = True, None, None, None
+            self._tells_status = False
         self.connected(self._clock.now())
 
     def close(self) -> None:
@@ -72,7 +74,7 @@ class Feedback:
     @property
     def mode(self) -> Mode:
         """By the newest STATUS, if it is not too old to say."""
-        return condition.mode(self._current_status(self._clock.now()), self._unknown_is_ready)
+        return self._mode(self._current_status(self._clock.now()))
 
     def report_after(self, time: float, deadline: float) -> ArmReport:
         """A report that arrived after ``time``, as soon as there is one; DeviceTimeout, NotOpen, or how it was lost."""
@@ -192,9 +194,9 @@ class Feedback:
     def _on_status(self, status: Status, time: float) -> None:
         before, was = self.status, self.mode
         with self._lock:
-            self.status, self._status_at = status, time
+            self.status, self._status_at, self._tells_status = status, time, True
             self._status_rhythm.beat(time)
-        mode = condition.mode(status, self._unknown_is_ready)
+        mode = self._mode(status)
         changed = mode is not was or condition.faults(status) != condition.faults(before)
         if before is not None and mode is not Mode.READY and changed:
             why, advice = condition.why_not(status, mode)
@@ -209,7 +211,7 @@ class Feedback:
             self._report = report = ArmReport(
                 positions=positions[: self._joints],
                 velocities=None if velocities is None else velocities[: self._joints],
-                mode=condition.mode(status, self._unknown_is_ready),
+                mode=self._mode(status),
                 faults=condition.faults(status),
                 in_motion=self._in_motion(status),
                 time=time,
@@ -223,6 +225,10 @@ class Feedback:
                 self._unsubscribe(function)
                 why = f"the subscriber failed: {error!r}"
                 self.tell(DeviceError(self._arm, "hand over a report", why, "it gets no more reports"))
+
+    def _mode(self, status: Status | None) -> Mode:
+        """What has told how it is, and tells it no more, is not one that cannot."""
+        return condition.mode(status, self._unknown_is_ready and not (status is None and self._tells_status))
 
     def _in_motion(self, status: Status | None) -> bool | None:
         said = None if status is None else condition.known(status.in_motion)

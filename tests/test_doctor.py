@@ -15,7 +15,7 @@ from dualcal_hal.cellfile import load_cell
 from dualcal_hal.commissioning import Commissioning
 from dualcal_hal.errors import LinkLost
 from dualcal_hal.findings import Finding
-from dualcal_hal.robot import JointPath, Mode, Robot, RobotState, StopResult
+from dualcal_hal.robot import JointPath, Mode, Motion, Robot, RobotState, StopResult
 from tests.cells import TINY
 from tests.command_line import dualcal
 
@@ -335,8 +335,8 @@ def test_a_quaternion_with_a_pendants_few_digits_is_a_rotation(real, tmp_path, j
 class Mistaken(Robot):
     """An arm whose joints are others than the cell file says: turned by signs, and exchanged."""
 
-    def __init__(self, robot, order, sign):
-        self.name, self._robot = robot.name, robot
+    def __init__(self, robot, clock, order, sign):
+        self.name, self._robot, self._clock = robot.name, robot, clock
         self._order, self._sign = np.array(order), np.array(sign)
 
     @property
@@ -350,13 +350,18 @@ class Mistaken(Robot):
         return tuple(np.array(q)[self._order] * self._sign)
 
     def read(self, timeout):
-        state = self._robot.read(timeout)
+        return self._seen_state(self._robot.read(timeout))
+
+    def _seen_state(self, state):
         rest = (0.0,) * self.joints
         return RobotState(self._seen(state.positions), rest, state.mode, state.faults, state.time, state.sequence)
 
     def start(self, path):
         waypoints = tuple(self._true(waypoint) for waypoint in path.waypoints)
-        return self._robot.start(JointPath(waypoints, path.speed, path.acceleration))
+        sent = self._robot.start(JointPath(waypoints, path.speed, path.acceleration))
+        motion = Motion(self.name, self._clock)
+        sent.on_end(lambda: motion.end(sent.state, sent.final and self._seen_state(sent.final), sent.error))
+        return motion
 
     def subscribe(self, function):
         return lambda: None
@@ -377,7 +382,7 @@ def mistaken(monkeypatch):
 
         def robot(self, name):
             true = original(self, name)
-            return Mistaken(true, order, sign) if name == "right" else true
+            return Mistaken(true, self.clock, order, sign) if name == "right" else true
 
         monkeypatch.setattr(SimulatorBackend, "robot", robot)
 

@@ -160,7 +160,7 @@ class CellGuard:
             clearance=clearance,
             least=least - WATCH_SLACK - self._corridor,
             speed=lambda before, after, seconds: part_speed(body, before, after, seconds),
-            fastest=self._pace.bound,
+            fastest=self._pace.bound if robot.keeps_speed else self._pace.to_be_confirmed,
         )
 
     def _require_pace(self, robot: GuardedRobot, body: ArmBody, start: RobotState, path: JointPath) -> None:
@@ -182,6 +182,9 @@ class CellGuard:
     def _standing(self, other: GuardedRobot) -> RobotState:
         """Where the other arm stands; one that moves is nowhere for long enough to keep clear of."""
         state = other.fresh_state("move the other arm")
+        if self._watched:
+            # The watch would stop the motion at once: better not to begin it.
+            other.require_ready(state, "move the other arm")
         if other.moving or max(map(abs, state.velocities)) > STANDSTILL:
             raise CommandRefused(other.name, "move the other arm", "this one is moving", "wait until it has settled")
         return state
@@ -283,9 +286,7 @@ class GuardedRobot(Robot):
 
     def _start(self, path: JointPath, admit: _Admission) -> Motion:
         state = self.fresh_state("move")
-        if state.mode is not Mode.READY or state.faults:
-            what = ", ".join([f"mode '{state.mode}'", *state.faults])
-            raise CommandRefused(self.name, "move", f"the arm is not ready: {what}", "clear it at the controller")
+        self.require_ready(state, "move")
         left_at = None if self._motion is None else self._motion.final
         away = 0.0 if left_at is None else float(np.max(np.abs(np.subtract(state.positions, left_at.positions))))
         if away > LEFT_WITHIN:
@@ -321,8 +322,10 @@ class GuardedRobot(Robot):
         watch = Watch(self._robot, bounds, self._clock, alarm)
         try:
             sent = self._robot.start(path)
-        except BaseException:
+        except BaseException as error:
             watch.end()
+            if found:  # what is raised is only that it was stopped
+                raise found[0] from error
             raise
 
         def ended() -> None:
@@ -354,6 +357,12 @@ class GuardedRobot(Robot):
         if (why := self._unusable(state)) is not None:
             raise CommandRefused(self.name, attempted, why, _ENCODERS)
         return state
+
+    def require_ready(self, state: RobotState, attempted: str) -> None:
+        """CommandRefused if the arm would not move, or has a fault, by its ``state``."""
+        if state.mode is not Mode.READY or state.faults:
+            what = ", ".join([f"mode '{state.mode}'", *state.faults])
+            raise CommandRefused(self.name, attempted, f"the arm is not ready: {what}", "clear it at the controller")
 
     def _unusable(self, state: RobotState) -> str | None:
         for what, values in (("positions", state.positions), ("velocities", state.velocities)):

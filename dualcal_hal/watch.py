@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualcal_hal.clock import Clock
-from dualcal_hal.errors import DeviceError, DeviceTimeout, MotionFailed
+from dualcal_hal.errors import DeviceError, DeviceTimeout, MotionFailed, MotionStopped
 from dualcal_hal.robot import Joints, Mode, Robot, RobotState
 from dualcal_hal.transforms import Array
 
@@ -86,6 +86,8 @@ class Watch:
         self._wake.set()
 
     def _on_failure(self, error: DeviceError) -> None:
+        if isinstance(error, MotionStopped):
+            return  # stopped along with an arm of the same controller: whoever stopped that knows why
         self._failure = self._failure or error
         self._wake.set()
 

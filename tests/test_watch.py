@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 
 from backends.controller.joint_map import JointMap
 from backends.controller.robot import ControlledRobot, OwnSpeed
 from dualcal_hal.clock import RealClock
-from dualcal_hal.errors import CommandRefused, DeviceTimeout, LinkLost, MotionFailed
+from dualcal_hal.errors import CommandRefused, DeviceTimeout, LinkLost, MotionFailed, MotionStopped
 from dualcal_hal.geometry import CellGeometry
 from dualcal_hal.guard import CellGuard, GuardedRobot
 from dualcal_hal.limits import JointLimits
 from dualcal_hal.pace import FULL_PACE, REDUCED_SPEED, Pace
 from dualcal_hal.robot import Mode, MotionState
-from dualcal_hal.watch import off_path
+from dualcal_hal.watch import LOOK_EVERY, off_path
 from tests.cells import paper_cell
 from tests.stub_link import StubLink
 
@@ -147,6 +149,53 @@ def test_an_arm_that_is_faster_than_it_may_be_is_stopped_and_the_other_too(rig, 
         motion.wait(AMPLE)
     assert cell.links["left"].stops
     assert cell.links["right"].stops
+
+
+def test_an_observed_speed_above_what_is_confirmed_stops_an_arm_with_a_speed_of_its_own(rig, monkeypatch):
+    cell = rig(pace=Pace(share=0.5), own_speed=OwnSpeed(0.1))
+    motion = cell.start("left", ASIDE)
+    course = cell.links["left"].courses[0]
+    planned = course.sample
+    monkeypatch.setattr(course, "sample", lambda t: (planned(6 * t)[0], 6 * planned(6 * t)[1]))
+    with pytest.raises(MotionFailed, match=r"left: move: it moves at \d+ mm/s, and 125 mm/s is the most it may"):
+        motion.wait(AMPLE)
+    assert cell.links["left"].stops
+    assert cell.links["right"].stops
+
+
+def test_an_arm_does_not_begin_to_move_while_the_other_has_a_fault(rig):
+    for happens in (_fault, _emergency):
+        cell = rig()
+        happens(cell.links["right"])
+        with pytest.raises(CommandRefused, match="right: move the other arm: the arm is not ready: "):
+            cell.start("left", ASIDE)
+        assert not cell.links["left"].courses
+
+
+def test_what_goes_wrong_with_one_while_the_other_begins_is_what_is_told(rig, monkeypatch):
+    cell, stopped = rig(), threading.Event()
+    link, stop = cell.links["left"], cell.links["left"].stop
+
+    def send(course):
+        """As a download that is stopped before all of it was taken."""
+        _fault(cell.links["right"])
+        assert stopped.wait(AMPLE)
+        raise MotionStopped("left", "move", "stopped: something is wrong with the other arm")
+
+    monkeypatch.setattr(link, "send", send)
+    monkeypatch.setattr(link, "stop", lambda reason: (stop(reason), stopped.set()))
+    with pytest.raises(MotionFailed, match=r"right: watch: .*joint 4 \(node 4\): code 0x7305 encoder"):
+        cell.start("left", ASIDE)
+
+
+def test_an_arm_that_is_stopped_along_with_the_other_hides_not_why(rig):
+    cell = rig()
+    motion = cell.start("left", ASIDE)
+    cell.links["right"].fail(MotionStopped("right", "move", "stopped: error 4 of the controller"))
+    threading.Event().wait(4 * LOOK_EVERY)
+    cell.links["left"].fail(MotionFailed("left", "move", "error 4 of the controller"))
+    with pytest.raises(MotionFailed, match="left: move: error 4 of the controller"):
+        motion.wait(AMPLE)
 
 
 def test_clearance_that_falls_because_the_other_arm_has_moved_stops_both(rig):

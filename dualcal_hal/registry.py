@@ -6,7 +6,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 
 from dualcal_hal.backend import Backend
-from dualcal_hal.errors import UsageError
+from dualcal_hal.errors import CellFileError, Problem, UsageError
 
 ENTRY_POINT_GROUP = "dualcal.backends"
 
@@ -35,6 +35,16 @@ def backend_class(name: str) -> type[Backend]:
     if not (isinstance(found, type) and issubclass(found, Backend)):
         raise UsageError(f"backend '{name}': {location} is no Backend")
     return found
+
+
+def require_extra(place: str, extra: str, modules: tuple[str, ...]) -> None:
+    """CellFileError if what a ``place`` of the cell file needs is not installed: refused before anything is begun."""
+    for module in modules:
+        try:
+            import_module(module)
+        except ImportError as error:
+            what = f"needs {module}, which cannot be imported ({error}): pip install 'dualcal[{extra}]'"
+            raise CellFileError([Problem(place, what)]) from error
 
 
 def _locations() -> dict[str, str]:

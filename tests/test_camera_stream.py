@@ -17,12 +17,12 @@ zmq = pytest.importorskip("zmq", reason="the zmq camera is an extra: pip install
 
 from zmq.auth import create_certificates  # noqa: E402 - what it needs may be missing
 
-from backends.cameras import backend as backend_module  # noqa: E402
 from backends.cameras import subscriber  # noqa: E402
 from backends.cameras.curve import ServerKeys  # noqa: E402
 from backends.cameras.publisher import FramePublisher  # noqa: E402
 from backends.cameras.whose_clock import ClockId  # noqa: E402
 from backends.cameras.zmq_backend import ZmqBackend  # noqa: E402
+from dualcal_hal import registry  # noqa: E402
 from dualcal_hal.cellfile import standing_alone  # noqa: E402
 from dualcal_hal.errors import (  # noqa: E402
     CellFileError,
@@ -450,7 +450,7 @@ def test_what_is_not_installed_is_a_problem_of_the_cell_file(monkeypatch: pytest
         raise ImportError(f"No module named '{module}'")
 
     cell = camera_cell(f"{{type: zmq, endpoint: '{NOBODY}'}}")
-    monkeypatch.setattr(backend_module, "import_module", missing)
+    monkeypatch.setattr(registry, "import_module", missing)
     with pytest.raises(CellFileError, match=r"backends\.lens: .*pip install 'dualcal\[zmq\]'"):
         ZmqBackend("lens", cell)
 

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
+
 import pytest
 from ruamel.yaml import YAML
 
+from backends.controller import ControllerBackend
+from backends.controller.emulator.process import Emulator
+from dualcal_hal import registry
+from dualcal_hal.cellfile import load_cell
+from dualcal_hal.errors import CellFileError
 from tests.cells import PAPER
 
 DEVICES = {("backends",), ("camera", "backend"), ("robots", "left", "backend"), ("robots", "right", "backend")}
@@ -34,3 +41,34 @@ def test_fast_cells_have_arms_five_times_faster_and_nothing_else(name):
     assert differences(slow, fast) == SPEEDS
     for _, arm, key in SPEEDS:
         assert fast["robots"][arm][key] == [5 * value for value in slow["robots"][arm][key]]
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """As if a module were not installed."""
+
+    def arrange(module):
+        def missing(name):
+            if name == module:
+                raise ImportError(f"No module named '{name}'")
+            return importlib.import_module(name)
+
+        monkeypatch.setattr(registry, "import_module", missing)
+
+    return arrange
+
+
+def test_what_drives_on_can_need_and_is_not_installed_is_a_problem_of_the_cell_file(without):
+    without("canopen")
+    with pytest.raises(CellFileError, match=r"backends\.cell\.link\.can: needs canopen.*pip install 'dualcal\[can\]'"):
+        ControllerBackend("cell", load_cell(PAPER.with_name("paper-can.yaml")))
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "where"),
+    [("paper-can", "canopen", r"backends\.cell\.link\.can"), ("paper-tcp", "zmq", r"backends\.eye")],
+)
+def test_what_an_emulator_needs_and_is_not_installed_is_too(without, name, module, where):
+    without(module)
+    with pytest.raises(CellFileError, match=f"{where}: needs {module}"):
+        Emulator(PAPER.with_name(f"{name}.yaml"), free_ports=True, say=print, failed=print)

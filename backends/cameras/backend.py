@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from backends.cameras.camera import DrivenCamera
 from backends.cameras.driver import Driver
 from dualcal_hal.backend import Backend
 from dualcal_hal.clock import RealClock
-from dualcal_hal.errors import CellFileError, Problem, UnknownDevice, UsageError
+from dualcal_hal.errors import UnknownDevice, UsageError
 from dualcal_hal.robot import Robot
 
 if TYPE_CHECKING:
@@ -69,13 +68,3 @@ class CameraBackend(Backend):
         if name != CAMERA:
             raise UnknownDevice(name, "find the camera", f"'{self.name}' has {CAMERA}")
         return self._camera
-
-
-def require_extra(backend: str, type_: str, modules: tuple[str, ...]) -> None:
-    """CellFileError if what a backend's type needs is not installed: refused before anything is begun."""
-    for module in modules:
-        try:
-            import_module(module)
-        except ImportError as error:
-            what = f"is of type {type_}, and {module} cannot be imported ({error}): pip install 'dualcal[{type_}]'"
-            raise CellFileError([Problem(f"backends.{backend}", what)]) from error

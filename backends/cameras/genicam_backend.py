@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, Field
 
-from backends.cameras.backend import CAMERA, CameraBackend, require_extra
+from backends.cameras.backend import CAMERA, CameraBackend
 from backends.cameras.driver import Driver
 from backends.cameras.features import Features, translated
 from backends.cameras.genicam_driver import PIXELS, Asking, GenicamDriver, OwnAcquisition, SoftwareTrigger
@@ -17,6 +17,7 @@ from dualcal_hal.config.files import BesideTheCellFile
 from dualcal_hal.config.values import Number, Positive, Section
 from dualcal_hal.errors import LinkLost, UnknownDevice
 from dualcal_hal.findings import Finding
+from dualcal_hal.registry import require_extra
 
 if TYPE_CHECKING:
     from dualcal_hal.cellfile import CellFile
@@ -52,7 +53,7 @@ class GenicamBackend(CameraBackend):
 
     def __init__(self, name: str, cell: CellFile) -> None:
         super().__init__(name, cell)
-        require_extra(name, "genicam", ("genicam.gentl", "harvesters.core"))
+        require_extra(f"backends.{name}", "genicam", ("genicam.gentl", "harvesters.core"))
 
     def connect(self, timeout: float) -> Driver:
         options: GenicamOptions = self.options

@@ -7,15 +7,19 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
-from backends.cameras.backend import CAMERA, CameraBackend, require_extra
+from backends.cameras.backend import CAMERA, CameraBackend
 from backends.cameras.curve import ClientKeys, host_of, is_loopback
 from backends.cameras.driver import Driver
 from dualcal_hal.config.files import BesideTheCellFile
 from dualcal_hal.config.values import Section
 from dualcal_hal.errors import UsageError
+from dualcal_hal.registry import require_extra
 
 if TYPE_CHECKING:
     from dualcal_hal.cellfile import CellFile
+
+ZMQ_NEEDS = ("zmq", "msgspec")
+"""Modules of the extra of that name."""
 
 
 class CurveOptions(Section):
@@ -56,7 +60,7 @@ class ZmqBackend(CameraBackend):
 
     def __init__(self, name: str, cell: CellFile) -> None:
         super().__init__(name, cell)
-        require_extra(name, "zmq", ("zmq", "msgspec"))
+        require_extra(f"backends.{name}", "zmq", ZMQ_NEEDS)
         options: ZmqOptions = self.options
         self._endpoint, self._expected = options.endpoint, options.camera
         curve = options.curve

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from backends.controller.joint_map import JointMap
 from backends.controller.link import ArmLink
-from backends.controller.options import ControllerOptions, Link
+from backends.controller.options import CAN_NEEDS, ControllerOptions, Link
 from backends.controller.promptness import spare_the_heap
 from backends.controller.robot import ControlledRobot, OwnSpeed
 from dualcal_hal.backend import Backend
@@ -18,6 +18,7 @@ from dualcal_hal.camera import Camera
 from dualcal_hal.clock import RealClock
 from dualcal_hal.errors import CellFileError, Problem, UnknownDevice, UsageError
 from dualcal_hal.limits import JointLimits
+from dualcal_hal.registry import require_extra
 from dualcal_hal.robot import Joints
 
 if TYPE_CHECKING:
@@ -40,6 +41,8 @@ class ControllerBackend(Backend):
         assert isinstance(options, ControllerOptions)
         self._link = options.link
         self._clock = RealClock()
+        if self._link.can is not None:
+            require_extra(f"backends.{name}.link.can", "can", CAN_NEEDS)
         self._maps = _joint_maps(name, cell, self._link)
         speed = _own_speed(self._link)
         self._robots = {

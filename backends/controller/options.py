@@ -17,6 +17,9 @@ Dialect = Literal["rep", "abb", "fanuc", "motoman"]
 CORRIDOR_MM = {"abb": 10.0, "fanuc": 10.0}
 """What dialects that blend cut off corners by where the cell file does not say, mm."""
 
+CAN_NEEDS = ("can", "canopen")
+"""Modules of the extra that drives on CAN need."""
+
 
 class TcpArm(Section):
     """Where one arm's controller listens."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, Self
 
 from backends.controller.emulator.faults import FaultSchedule, parse_fault
 from backends.controller.emulator.world import EmulatedWorld
-from backends.controller.options import CanLink, ControllerOptions
+from backends.controller.options import CAN_NEEDS, CanLink, ControllerOptions
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.errors import CellFileError, Contact, Problem, UsageError
+from dualcal_hal.registry import require_extra
 
 if TYPE_CHECKING:
     from backends.controller.emulator.drives import DriveBuses
@@ -50,6 +51,7 @@ class Emulator:
         self._free_ports, self._say, self._failed = free_ports, say, failed
         self._faults = [parse_fault(fault, self._file.cell.robots) for fault in faults]
         self._controllers, self._cameras = _backends(self._file)
+        _require_extras(self._controllers, self._cameras)
         self.endpoints: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
@@ -156,6 +158,17 @@ def _backends(file: CellFile) -> tuple[dict[str, ControllerOptions], list[str]]:
     if problems:
         raise CellFileError(problems)
     return controllers, cameras
+
+
+def _require_extras(controllers: Mapping[str, ControllerOptions], cameras: Sequence[str]) -> None:
+    """CellFileError if what one of them needs is not installed."""
+    from backends.cameras.zmq_backend import ZMQ_NEEDS
+
+    for name, options in controllers.items():
+        if options.link.can is not None:
+            require_extra(f"backends.{name}.link.can", "can", CAN_NEEDS)
+    for name in cameras:
+        require_extra(f"backends.{name}", "zmq", ZMQ_NEEDS)
 
 
 def _port(options: CanLink) -> int:

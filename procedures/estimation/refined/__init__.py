@@ -1,0 +1,1 @@
+"""Joint maximum likelihood of both transforms from all corners of all captures."""

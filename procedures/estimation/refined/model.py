@@ -1,0 +1,208 @@
+"""The measurement model, linearised: pixels to a capture's pose, to an arrival's pose, to the cell.
+
+All that a capture says passes through the pose of the camera in the passive base, T_P_E, which is the same for all
+captures of an arrival. So each capture's corners become six by six information on it, from which the errors of the
+passive arm are marginalised; their sum over an arrival is information on its T_P_E, from which the errors of the
+active arm are marginalised; what is left is information on the cell. Time and memory are linear in captures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualcal_hal.transforms import Array, Mask, apply, inverse, skew
+from procedures.estimation.projection import project, project_with_jacobian
+from procedures.estimation.refined.data import CaptureArrays, Knowns, Noise
+from procedures.estimation.refined.motion import adjoint, in_flange, moved
+
+CELL = 12
+"""Unknowns of the cell: motions of T_P_A, then of T_H_E."""
+
+
+@dataclass(frozen=True)
+class State:
+    """T_P_A, T_H_E (4, 4); errors of the arms in units of their sigma: active (a, na) of the arrivals, passive
+    (k, np) of the captures.
+    """
+
+    T_P_A: Array
+    T_H_E: Array
+    active: Array
+    passive: Array
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """At a state: cost, a sum of squares in units of sigma; normal (12, 12) and gradient (12,) of the cell with all
+    errors of the arms marginalised.
+
+    Per capture: pixel_normal (k, 6, 6) and pixel_gradient (k, 6) on T_P_E from the pixels alone, capture_normal
+    (k, 6, 6) with the passive arm marginalised, squares (k,) of pixels in units of sigma. Per arrival: arrival_normal
+    (a, 6, 6), the sum of those, pose_normal (a, 6, 6) with the active arm marginalised too. towards_cell (a, 6, 12):
+    how the cell moves T_P_E; towards_active (a, 6, na) and towards_passive (k, 6, np): how the arms do, by a sigma.
+    """
+
+    cost: float
+    normal: Array
+    gradient: Array
+    squares: Array
+    pixel_normal: Array
+    pixel_gradient: Array
+    capture_normal: Array
+    arrival_normal: Array
+    arrival_gradient: Array
+    pose_normal: Array
+    towards_cell: Array
+    towards_active: Array
+    towards_passive: Array
+    passive_gain: Array
+    passive_step: Array
+    active_gain: Array
+    active_step: Array
+
+
+class Model:
+    """Captures and knowns as arrays that no state changes. Arrivals are numbered in the order of their first capture;
+    an arrival's reading is the median of its captures'.
+    """
+
+    def __init__(self, data: CaptureArrays, knowns: Knowns, noise: Noise) -> None:
+        self.knowns, self.noise = knowns, noise
+        labels, first, arrival = np.unique(data.arrivals, return_index=True, return_inverse=True)
+        rank = np.argsort(np.argsort(first))
+        self.labels = labels[np.argsort(first)]
+        self.arrival: Array = rank[arrival.ravel()]
+        self.active = arrival_readings(data.active, self.arrival, len(labels))
+        self.T_A_H = knowns.active.forward(self.active)
+        self.T_P_F = knowns.passive.forward(data.passive)
+        self.J_active = in_flange(knowns.active.jacobian(self.active), self.T_A_H)
+        self.J_passive = in_flange(knowns.passive.jacobian(data.passive), self.T_P_F)
+        self.seen: Mask = np.isfinite(data.pixels).all(axis=-1)
+        self.pixels = np.where(self.seen[..., None], data.pixels, 0.0)
+
+    @property
+    def arrivals(self) -> int:
+        return len(self.T_A_H)
+
+    @property
+    def captures(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def measurements(self) -> int:
+        """Numbers measured: two for each corner."""
+        return 2 * int(self.seen.sum())
+
+    def state(self, T_P_A: Array, T_H_E: Array) -> State:
+        """With both arms exactly where they were read."""
+        active, passive = self.J_active.shape[-1], self.J_passive.shape[-1]
+        return State(T_P_A, T_H_E, np.zeros((self.arrivals, active)), np.zeros((self.captures, passive)))
+
+    def cost(self, state: State) -> float:
+        """Sum of squares in units of sigma; infinite if a corner that was seen is not in front of the camera."""
+        squares = float(np.sum(self.residuals(state) ** 2) + np.sum(state.active**2) + np.sum(state.passive**2))
+        return squares if np.isfinite(squares) else np.inf
+
+    def residuals(self, state: State) -> Array:
+        """(k, n, 2) of the pixels in units of sigma, 0 for a corner that was not seen."""
+        in_camera = apply(self._target_in_camera(state)[1], self.knowns.corners)
+        return self._whitened(project(in_camera, self.knowns.matrix, self.knowns.distortion))
+
+    def linearised(self, state: State) -> Linearised:
+        T_E_P, T_E_T = self._target_in_camera(state)
+        in_camera = apply(T_E_T, self.knowns.corners)
+        pixels, J_pixel = project_with_jacobian(in_camera, self.knowns.matrix, self.knowns.distortion)
+        # A motion (v, w) of T_P_E moves a point's coordinates p in the camera by -v + p x w.
+        J = np.concatenate([-J_pixel, J_pixel @ skew(in_camera)], axis=-1) / self.noise.pixel
+        J = np.where(self.seen[..., None, None], J, 0.0).reshape(self.captures, -1, 6)
+        r = self._whitened(pixels).reshape(self.captures, -1)
+        J_T = np.swapaxes(J, 1, 2)
+        L, g = J_T @ J, (J_T @ r[..., None])[..., 0]
+
+        # From the target on its flange to the camera: the passive arm moves T_P_E the other way.
+        T_E_F = T_E_T @ inverse(self.knowns.T_F_T)
+        P = -self.noise.passive * adjoint(T_E_F) @ self.J_passive
+        W, gw, passive_gain, passive_step = _marginalised(L, g, P, state.passive)
+        arrival_normal, arrival_gradient = self._summed(W), self._summed(gw)
+
+        T_E_H = inverse(state.T_H_E)
+        A = self.noise.active * adjoint(T_E_H) @ self.J_active
+        pose_normal, pose_gradient, active_gain, active_step = _marginalised(
+            arrival_normal, arrival_gradient, A, state.active
+        )
+        G = np.empty((self.arrivals, 6, CELL))
+        G[:, :, :6] = adjoint(T_E_P @ state.T_P_A)
+        G[:, :, 6:] = np.eye(6)
+        G_T = np.swapaxes(G, 1, 2)
+        squares = np.sum(r**2, axis=1)
+        return Linearised(
+            cost=float(squares.sum() + np.sum(state.active**2) + np.sum(state.passive**2)),
+            normal=np.sum(G_T @ pose_normal @ G, axis=0),
+            gradient=np.sum((G_T @ pose_gradient[..., None])[..., 0], axis=0),
+            squares=squares,
+            pixel_normal=L,
+            pixel_gradient=g,
+            capture_normal=W,
+            arrival_normal=arrival_normal,
+            arrival_gradient=arrival_gradient,
+            pose_normal=pose_normal,
+            towards_cell=G,
+            towards_active=A,
+            towards_passive=P,
+            passive_gain=passive_gain,
+            passive_step=passive_step,
+            active_gain=active_gain,
+            active_step=active_step,
+        )
+
+    def stepped(self, state: State, at: Linearised, step: Array) -> State:
+        """The state after the cell has moved by ``step`` (12,), with the arms' errors where they then fit best."""
+        pose = at.towards_cell @ step
+        active_step = at.active_step - (at.active_gain @ pose[..., None])[..., 0]
+        pose = pose + (at.towards_active @ active_step[..., None])[..., 0]
+        passive_step = at.passive_step - (at.passive_gain @ pose[self.arrival][..., None])[..., 0]
+        return State(
+            T_P_A=moved(state.T_P_A, step[:6]),
+            T_H_E=moved(state.T_H_E, step[6:]),
+            active=state.active + active_step,
+            passive=state.passive + passive_step,
+        )
+
+    def _target_in_camera(self, state: State) -> tuple[Array, Array]:
+        """T_E_P of the arrivals (a, 4, 4), T_E_T of the captures (k, 4, 4)."""
+        active = self.noise.active * (self.J_active @ state.active[..., None])[..., 0]
+        passive = self.noise.passive * (self.J_passive @ state.passive[..., None])[..., 0]
+        T_E_P = inverse(state.T_P_A @ moved(self.T_A_H, active) @ state.T_H_E)
+        return T_E_P, T_E_P[self.arrival] @ moved(self.T_P_F, passive) @ self.knowns.T_F_T
+
+    def _whitened(self, pixels: Array) -> Array:
+        return np.where(self.seen[..., None], pixels - self.pixels, 0.0) / self.noise.pixel
+
+    def _summed(self, per_capture: Array) -> Array:
+        total = np.zeros((self.arrivals, *per_capture.shape[1:]))
+        np.add.at(total, self.arrival, per_capture)
+        return total
+
+
+def arrival_readings(active: Array, arrival: Array, arrivals: int) -> Array:
+    """(a, na): the median of the active joints (k, na) over the captures of each arrival; arrival (k,) from 0."""
+    if np.bincount(arrival, minlength=arrivals).max(initial=0) <= 1:
+        return active[np.argsort(arrival)]
+    return np.stack([np.median(active[arrival == a], axis=0) for a in range(arrivals)])
+
+
+def _marginalised(normal: Array, gradient: Array, towards: Array, errors: Array) -> tuple[Array, Array, Array, Array]:
+    """Information (b, 6, 6) and gradient (b, 6) on a pose without the errors (b, n), of unit sigma, that move it by
+    ``towards`` (b, 6, n); and how the errors follow: by ``step - gain @ motion of the pose``.
+    """
+    towards_T = np.swapaxes(towards, 1, 2)
+    seen = towards_T @ normal
+    inner = np.eye(towards.shape[-1]) + seen @ towards
+    own = (towards_T @ gradient[..., None])[..., 0] + errors
+    solved = np.linalg.solve(inner, np.concatenate([seen, own[..., None]], axis=-1))
+    gain, step = solved[..., :6], -solved[..., 6]
+    seen_T = np.swapaxes(seen, 1, 2)
+    left = normal - seen_T @ gain
+    return (left + np.swapaxes(left, 1, 2)) / 2, gradient + (seen_T @ step[..., None])[..., 0], gain, step

@@ -114,6 +114,11 @@ class Engine:
         self._abort_reason = reason
         self._wake.set()
 
+    @property
+    def aborted(self) -> bool:
+        """Whether :meth:`abort` was called."""
+        return self._abort_reason is not None
+
     def _drive(self, procedure: Procedure[T]) -> T:
         reply: Any = None
         error: DualcalError | None = None
@@ -169,7 +174,7 @@ class Engine:
                 raise TypeError(f"{step!r} is no step")
 
     def _ask(self, shown: Callable[[], object]) -> None:
-        agreed = self._confirm(shown, lambda: self._abort_reason is not None)
+        agreed = self._confirm(shown, lambda: self.aborted)
         self._raise_if_aborted()
         if not agreed:
             raise NotConfirmed("not confirmed by the operator: no arm is moved any further")

@@ -128,7 +128,7 @@ def _finish(run: _Run, file: CellFile, cell: Cell, session: Session) -> Intrinsi
                 watcher,
                 lambda engine: signals.pass_on_to(engine.abort),
                 operator.confirms,
-                prepare=lambda opened: prepare_arms(run.console, run.options, opened, operator),
+                prepare=lambda opened, aborted: prepare_arms(run.console, run.options, opened, operator, aborted),
             )
         result = conclude(file, session)
         recording.document(RESULT_FILE, result.to_document())

@@ -44,12 +44,12 @@ class Operator:
             question = self._show(shown())
             return confirmed(self._console, question, aborted)
 
-    def agrees(self, question: str) -> bool:
+    def agrees(self, question: str, aborted: Callable[[], bool]) -> bool:
         """Ask, with nothing to show."""
         if not self._asked:
             return True
         with self._display.paused():
-            return confirmed(self._console, question)
+            return confirmed(self._console, question, aborted)
 
     def _show(self, proposal: object) -> str:
         """Show it; the question to ask."""
@@ -71,15 +71,17 @@ class Operator:
         raise TypeError(f"{proposal!r} is nothing to be shown")
 
 
-def confirmed(console: Console, question: str, aborted: Callable[[], bool] = lambda: False) -> bool:
+def confirmed(console: Console, question: str, aborted: Callable[[], bool]) -> bool:
     """Whether the operator says yes; anything else, an end of the input and an abort meanwhile are a no.
 
     Signals break into nothing while devices are open, so the answer is waited for with an eye on ``aborted``.
     """
     console.print(f"{question} [y/N]: ", end="", soft_wrap=True, highlight=False)
+    if sys.stdin is None:  # closed by whoever started this
+        return False
     try:
         descriptor = sys.stdin.fileno()
-    except (io.UnsupportedOperation, ValueError, AttributeError):
+    except (io.UnsupportedOperation, ValueError):
         return _yes(typer.get_text_stream("stdin").readline())
     while not aborted():
         if select.select([descriptor], [], [], _POLL)[0]:

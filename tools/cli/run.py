@@ -270,7 +270,7 @@ def _run(
                     watcher,
                     lambda engine: signals.pass_on_to(engine.abort),
                     operator.confirms,
-                    prepare=lambda opened: prepare_arms(console, options, opened, operator),
+                    prepare=lambda opened, aborted: prepare_arms(console, options, opened, operator, aborted),
                 )
         except BaseException as error:
             try:
@@ -334,16 +334,17 @@ def execute(
     watcher: Observer,
     begun: Callable[[Engine], None] = lambda engine: None,
     confirm: Confirmation = lambda shown, aborted: True,
-    prepare: Callable[[Cell], None] = lambda cell: None,
+    prepare: Callable[[Cell, Callable[[], bool]], None] = lambda cell, aborted: None,
 ) -> None:
     """Run the procedure on the cell's devices, which are closed again on any exit.
 
-    ``begun`` gets the engine; ``confirm`` asks the operator; ``prepare`` is done once the devices are open.
+    ``begun`` gets the engine; ``confirm`` asks the operator; ``prepare`` is done once the devices are open, and told
+    what says whether the run was aborted.
     """
     with Observers(watcher) as observers, cell as opened:
         engine = Engine(opened, session, observers, confirm)
         begun(engine)
-        prepare(opened)
+        prepare(opened, lambda: engine.aborted)
         with _documents_kept(opened, session):
             engine.run(calibration.steps())
 
@@ -451,11 +452,13 @@ def commissioned(cell: Cell, options: RunOptions, file: CellFile, path: Path) ->
     return commissioning
 
 
-def prepare_arms(console: Console, options: RunOptions, cell: Cell, operator: Operator) -> None:
+def prepare_arms(
+    console: Console, options: RunOptions, cell: Cell, operator: Operator, aborted: Callable[[], bool]
+) -> None:
     """What the operator wants done before the procedure begins, once the devices are open."""
     if not (options.enable or options.emulate):
         return
-    if not operator.agrees("Switch the drives of both arms on?"):
+    if not operator.agrees("Switch the drives of both arms on?", aborted):
         raise NotConfirmed("not confirmed by the operator: the drives were left as they are")
     for name in cell.enable_arms():
         say_line(console, f"{name}: its drives are on")

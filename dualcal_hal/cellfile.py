@@ -473,12 +473,13 @@ def _suggestion(location: Location) -> str:
 
 
 def _known_keys(location: Location) -> list[str]:
-    """The keys of the section at ``location``."""
+    """The keys of the section at ``location``; none where the schema leaves them to a backend's options."""
     schema = cell_schema()
     section = schema
     for part in location:
         inner = section.get("properties", {}).get(part) or section.get("items")
-        section = _resolved(schema, inner or section.get("additionalProperties", {}))
+        further = section.get("additionalProperties")
+        section = _resolved(schema, inner or (further if isinstance(further, dict) else {}))
     return list(section.get("properties", {}))
 
 

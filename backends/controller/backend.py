@@ -153,6 +153,7 @@ def _redirected(name: str, link: Link, endpoints: Mapping[str, Any]) -> Link:
         arms = told if kind == "tcp" else told["arms"]
         if kind == "can":
             document["can"]["interface"] = told["interface"]
+            document["can"].pop("bitrate", None)  # the emulator's bus has none
         for arm in document[kind]["arms"]:
             document[kind]["arms"][arm].update(arms[arm])
         return Link.model_validate(document)

@@ -17,6 +17,14 @@ Dialect = Literal["rep", "abb", "fanuc", "motoman"]
 CORRIDOR_MM = {"abb": 10.0, "fanuc": 10.0}
 """What dialects that blend cut off corners by where the cell file does not say, mm."""
 
+BITRATE_ELSEWHERE = {
+    "socketcan": "set it by: ip link set CHANNEL type can bitrate N",
+    "socketcand": "it is set where socketcand runs",
+    "virtual": "a virtual bus has none",
+    "udp_multicast": "a bus in a network has none",
+}
+"""Interfaces that do not set the bit rate, and who does."""
+
 CAN_NEEDS = ("can", "canopen")
 """Modules of the extra that drives on CAN need."""
 
@@ -159,6 +167,9 @@ class CanLink(Section):
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
         problems = []
+        if self.bitrate is not None and self.interface in BITRATE_ELSEWHERE:
+            elsewhere = BITRATE_ELSEWHERE[self.interface]
+            problems.append(f"bitrate is no option of {self.interface}: {elsewhere}")
         channels: dict[str, str] = {}
         for name, arm in self.arms.items():
             if arm.channel in channels:

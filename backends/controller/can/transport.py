@@ -20,12 +20,6 @@ from dualcal_hal.clock import Clock
 from dualcal_hal.errors import CommandRefused, DeviceError, DeviceTimeout, LinkLost
 
 _RECEIVE = 0.05  # s; how long the reader waits before it looks whether it is to end
-_BITRATE_ELSEWHERE = {
-    "socketcan": "set it by: ip link set CHANNEL type can bitrate N",
-    "socketcand": "it is set where socketcand runs",
-    "virtual": "a virtual bus has none",
-    "udp_multicast": "a bus in a network has none",
-}
 
 # What python-can and canopen log is told by our errors; without a handler it would go to the operator's terminal.
 for _library in ("can", "canopen"):
@@ -173,22 +167,19 @@ class Transport:
 
 
 def _refuse_unless_exact(device: str, address: BusAddress) -> None:
-    """Options that do not fit the interface are errors, as misspelt ones are in the cell file."""
-    why, advice = "", "correct the cell file"
+    """What python-can would take without a word, or tell otherwise."""
+    advice = "correct the cell file"
     if address.interface not in can.VALID_INTERFACES:
         why, advice = (
             f"python-can has no interface {address.interface}",
             "it has " + ", ".join(sorted(can.VALID_INTERFACES)),
         )
-    elif address.bitrate is not None and address.interface in _BITRATE_ELSEWHERE:
-        why = f"bitrate is no option of {address.interface}: {_BITRATE_ELSEWHERE[address.interface]}"
-    elif address.interface == "socketcand":
+        raise CommandRefused(device, "open the bus", why, advice)
+    if address.interface == "socketcand":
         try:
             address_of(address.channel)
         except ValueError as error:
             raise CommandRefused(device, "open the bus", f"channel {error}", advice) from error
-    if why:
-        raise CommandRefused(device, "open the bus", why, advice)
 
 
 def _opened(device: str, address: BusAddress, clock: Clock, deadline: float) -> Wire:

@@ -193,6 +193,17 @@ def test_set_points_that_stream_are_followed() -> None:
         assert not arm.in_motion  # nothing new
 
 
+def test_being_told_to_stand_where_an_encoder_shows_it_to_is_no_motion() -> None:
+    with world() as (emulated, file):
+        arm, home = emulated.arms["left"], file.cell.active.home
+        for flicker in (2e-5, -2e-5, 1e-5):
+            arm.command(home + flicker, 0.01)
+        assert arm.motions == 0
+        for way in (5e-5, 2e-4, 5e-4):
+            arm.command(home + way, 0.01)
+        assert arm.motions == 1
+
+
 def test_a_hold_brings_it_to_rest_on_its_way() -> None:
     with world() as (emulated, file):
         arm, home = emulated.arms["left"], file.cell.active.home

@@ -28,6 +28,7 @@ ENCODER_STEP = 2 * np.pi / 2**20
 SETTLING = 0.05
 """Seconds after its joints came to rest in which the error comes in that its encoders do not see."""
 
+_AWAY = 1e-4  # rad by which set points differ that are more than where a controller reads that it stands
 _SLOW = 1e-3  # rad/s below which a stretch of a motion has ended
 _SAME_TARGET = 1e-6  # rad: what belongs to a target does not depend on how its numbers were rounded on the wire
 
@@ -64,7 +65,8 @@ class EmulatedArm:
         self._before = self._stretch_start = config.home
         self._rested: float | None = -math.inf
         self._error_before = self._error_after = self._error_of(self._servo.destination)
-        self._moving = False
+        self._stood_at = config.home
+        self._moving = self._counted = False
         world.stepper.track(name, self._servo, 0.0)
 
     # What a controller asks
@@ -109,6 +111,7 @@ class EmulatedArm:
         with self._world.lock:
             now = self._world.now()
             self._tell(set_points, now)
+            self._count()
             return self._world.begin + now
 
     def command(self, q: Array, period: float) -> None:
@@ -119,6 +122,8 @@ class EmulatedArm:
             if np.array_equal(q, self._servo.destination):
                 return
             self._tell(Ramp(self._servo.commanded(now), q, period), now)
+            if np.max(np.abs(q - self._stood_at)) > _AWAY:
+                self._count()
 
     def hold(self) -> None:
         """Brake to rest as fast as it can, and stay there."""
@@ -171,13 +176,19 @@ class EmulatedArm:
     def _tell(self, set_points: SetPoints, now: float) -> None:
         if self._world.stepper.fault is not None:
             return  # parts touch: nothing moves any more
+        if not self._moving:
+            self._stood_at, self._counted = self._servo.commanded(now), False
         self._servo.tell(set_points, now)
         self._world.stepper.track(self.name, self._servo, now)
         self._error_before, self._rested = self._error(now), None
         self._approach = Approach(self._approach.slack, self._approach.way, math.inf)
-        began, self._moving = not self._moving, True
+        self._moving = True
         self._world.wake()
-        if began:
+
+    def _count(self) -> None:
+        """It has begun to move, unless it is doing so already, or parts touch."""
+        if self._moving and not self._counted:
+            self._counted = True
             self.motions += 1
             for listener in self._listeners:
                 listener(self)

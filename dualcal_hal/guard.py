@@ -309,14 +309,11 @@ class GuardedRobot(Robot):
 
         def alarm(error: DeviceError) -> None:
             found.append(error)
-            for robot in (self, bounds.other):
-                try:
-                    result = robot.stop(error.why)
-                except Exception as second:  # noqa: BLE001 - the other arm has to be stopped, too; told by the note
-                    error.add_note(f"{robot.name}: could not be stopped ({second}): use the emergency stop")
-                    continue
-                if not result.confirmed:
-                    error.add_note(f"{robot.name}: its stop is not confirmed ({result.detail}): use the emergency stop")
+            # Both at once: the stop of one whose link is lost is not confirmed for a while.
+            other = threading.Thread(target=_stopped, args=(bounds.other, error), name=f"stop {bounds.other.name}")
+            other.start()
+            _stopped(self, error)
+            other.join()
             motion.end(MotionState.FAILED, None, error)
 
         watch = Watch(self._robot, bounds, self._clock, alarm)
@@ -369,3 +366,14 @@ class GuardedRobot(Robot):
             if len(values) != len(self.limits.lower) or not np.all(np.isfinite(values)):
                 return f"its {what} are not {len(self.limits.lower)} finite numbers: {values}"
         return None
+
+
+def _stopped(robot: Robot, error: DeviceError) -> None:
+    """Stop an arm because of an error, which gets a note where it may not stand."""
+    try:
+        result = robot.stop(error.why)
+    except Exception as second:  # noqa: BLE001 - the other arm has to be stopped, too; told by the note
+        error.add_note(f"{robot.name}: could not be stopped ({second}): use the emergency stop")
+        return
+    if not result.confirmed:
+        error.add_note(f"{robot.name}: its stop is not confirmed ({result.detail}): use the emergency stop")

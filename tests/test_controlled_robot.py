@@ -262,6 +262,40 @@ def test_a_stop_is_sent_also_where_nothing_moves(robot, link):
     assert link.stops == ["to be sure"]
 
 
+def test_a_stop_is_sent_once_a_lost_link_is_there_again(robot, link, monkeypatch):
+    motion, stop, lost = robot.start(path((1.5, 0.0, 0.0))), link.stop, [1, 1, 1]
+
+    def again(reason):
+        if lost:
+            lost.pop()
+            raise LinkLost("left", "stop", "it is connected anew soon")
+        stop(reason)
+
+    monkeypatch.setattr(link, "stop", again)
+    assert robot.stop("enough").confirmed
+    assert link.stops == ["enough"]
+    with pytest.raises(MotionStopped, match="enough"):
+        motion.wait(AMPLE)
+
+
+def test_a_stop_that_could_not_be_sent_is_not_confirmed(robot, link, monkeypatch):
+    def unable(reason):
+        raise LinkLost("left", "stop", "the connection is gone")
+
+    monkeypatch.setattr(link, "stop", unable)
+    result = robot.stop("enough")
+    assert (result.confirmed, result.detail) == (False, "the connection is gone")
+
+
+def test_one_that_fails_when_told_of_a_failure_keeps_nobody_from_being_told(robot, link, caplog):
+    told, lost = [], LinkLost("left", "read", "the connection is gone")
+    robot.on_failure(lambda error: 1 / 0)
+    robot.on_failure(told.append)
+    link.fail(lost)
+    assert told == [lost]
+    assert "one that was told of a failure failed" in caplog.text
+
+
 def test_an_arm_that_goes_on_has_not_confirmed_its_stop(robot, link):
     link.obeys_stop = False
     motion = robot.start(path((1.9, 0.0, 0.0), (-1.9, 0.0, 0.0)))

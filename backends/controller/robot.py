@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,7 +16,7 @@ from backends.controller.following import STANDS_FOR, Following, Standing
 from backends.controller.joint_map import JointMap
 from backends.controller.link import ArmLink, ArmReport, Transfer
 from dualcal_hal.clock import Clock
-from dualcal_hal.errors import CommandRefused, DeviceError, DeviceTimeout, MotionFailed, NotOpen
+from dualcal_hal.errors import CommandRefused, DeviceError, DeviceTimeout, LinkLost, MotionFailed, NotOpen
 from dualcal_hal.findings import Finding
 from dualcal_hal.limits import JointLimits
 from dualcal_hal.robot import JointPath, Mode, Motion, MotionState, Robot, RobotState, StopResult
@@ -26,6 +27,9 @@ STOP_CONFIRMED_WITHIN = 0.5
 
 STATE_TIMEOUT = 1.0
 """Seconds within which a report has to come before a motion."""
+
+
+_STOP_AGAIN_AFTER = 0.02  # s, where the link was lost
 
 
 @dataclass(frozen=True)
@@ -143,10 +147,10 @@ class ControlledRobot(Robot):
         with self._lock:
             following = self._following
             braking = 0.0 if following is None else following.stopping()
-        sent = self._clock.now()
+        deadline = self._clock.now() + braking + STOP_CONFIRMED_WITHIN
         try:
-            link.stop(reason)
-            result = self._standing_after(link, sent, sent + braking + STOP_CONFIRMED_WITHIN)
+            sent = self._send_stop(link, reason, deadline)
+            result = self._standing_after(link, sent, deadline)
         except DeviceError as error:
             result = StopResult(confirmed=False, detail=error.why)
         if following is not None:
@@ -219,7 +223,10 @@ class ControlledRobot(Robot):
 
     def _tell(self, error: DeviceError) -> None:
         for function in tuple(self._failures):
-            function(error)
+            try:
+                function(error)
+            except Exception:
+                logging.getLogger(__name__).exception("%s: one that was told of a failure failed", self.name)
 
     # -- states -------------------------------------------------------------------------------------------------
 
@@ -241,6 +248,18 @@ class ControlledRobot(Robot):
             return np.zeros(self.joints)
         change = np.subtract(report.positions, before.positions) / (report.time - before.time)
         return self._map.velocity_from_controller(change)
+
+    def _send_stop(self, link: ArmLink, reason: str, deadline: float) -> float:
+        """When it was sent, s. A lost link may be there again in time, and the arm still on its way."""
+        while True:
+            sent = self._clock.now()
+            try:
+                link.stop(reason)
+                return sent
+            except LinkLost:
+                if sent + _STOP_AGAIN_AFTER >= deadline:
+                    raise
+            self._clock.wait(threading.Event(), sent + _STOP_AGAIN_AFTER)
 
     def _standing_after(self, link: ArmLink, sent: float, deadline: float) -> StopResult:
         """Wait for a report after ``sent`` that says that the arm stands; DeviceTimeout where none comes at all."""

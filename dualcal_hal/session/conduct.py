@@ -58,6 +58,6 @@ def read_conduct(session: Session) -> Conduct:
 
 
 def keep_conduct(session: Session, conduct: Conduct) -> None:
-    """Write it down, unless there is nothing to say."""
-    if conduct != Conduct():
+    """Write it down, unless there is nothing to say, nor was before."""
+    if conduct != read_conduct(session):
         session.write_document(CONDUCT, conduct.to_document())

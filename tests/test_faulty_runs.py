@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from typing import Literal
 
 import numpy as np
 import pytest
 
-from dualcal_hal.errors import DeviceError
-from tests.guarded_cell import ARMS, MOTION, guarded
+from dualcal_hal.errors import CommandRefused, DeviceError
+from tests.guarded_cell import ARMS, BUS, MOTION, Guarded, guarded, wired_cell
 from tests.simple_message_client import PATIENCE
 
 AWAY = (0.8, 0.1)
 PING = 1
+ENABLE = 0x0F
+HOME = tuple(map(float, wired_cell("rep").cell.active.home))
 
 
 def test_a_drive_that_tells_an_emergency_stops_its_arm_by_name_and_code() -> None:
@@ -40,8 +43,15 @@ def test_the_lost_link_of_an_arm_that_stands_stops_the_one_that_moves() -> None:
         cell.start("right", 0.2).wait(PATIENCE)
 
 
-def test_a_server_that_is_restarted_with_its_arm_elsewhere_gets_no_motion_but_the_next_that_is_asked_for() -> None:
-    with guarded("rep") as cell:
+LINKS = [
+    "rep",
+    *(pytest.param(link, marks=pytest.mark.slow) for link in ("abb", "fanuc", "motoman", "can")),
+]
+
+
+@pytest.mark.parametrize("link", LINKS)
+def test_a_server_that_is_restarted_within_a_move_gets_no_motion_but_the_next_that_is_asked_for(link: str) -> None:
+    with guarded(link) as cell:
         motion = cell.start("left", *AWAY)
         cell.kill()
         with pytest.raises(DeviceError, match=r"left: "):
@@ -49,12 +59,58 @@ def test_a_server_that_is_restarted_with_its_arm_elsewhere_gets_no_motion_but_th
         cell.serve("robots.left.home_deg=[20, 0, 60, 0, 30, 0]")
         state = cell.reads("left")
         assert np.rad2deg(state.positions[0]) == pytest.approx(20, abs=0.1)
-        cell.reads("right")
-        cell.stays(cell.served.places(), 1.0)
-        for arm in ARMS:
-            assert all(identity == PING for identity in messages(cell.relays[arm, MOTION].sent[-1]))
+        stays_where_it_is(cell, link)
+        cell.enable()
         cell.start("left", -0.2).wait(PATIENCE)
         assert np.rad2deg(cell.reads("left").positions[0]) == pytest.approx(20 - np.rad2deg(0.2), abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("link", ["rep", "abb", "fanuc", "motoman", "can"])
+def test_nor_does_one_that_is_restarted_between_moves(link: str) -> None:
+    with guarded(link) as cell:
+        cell.start("left", *AWAY).wait(PATIENCE)
+        cell.kill()
+        cell.wait(lambda: not is_there(cell))
+        with pytest.raises(DeviceError, match=r"left: "):
+            cell.arms["left"].start(cell.guard.path("left", HOME, (HOME,)))
+        cell.serve()  # its arms are at home
+        assert cell.reads("left").positions == pytest.approx(HOME, abs=1e-3)
+        stays_where_it_is(cell, link)
+        cell.enable()
+        with pytest.raises(CommandRefused, match=r"left: move: it stands .* from where its last motion has ended"):
+            cell.start("left", 0.2)
+        cell.stays(cell.served.places())
+
+
+def is_there(cell: Guarded) -> bool:
+    try:
+        cell.arms["left"].read(1.0)
+    except DeviceError:
+        return False
+    return True
+
+
+def stays_where_it_is(cell: Guarded, link: str) -> None:
+    """A server that has just been started sees its clients come back, and nothing that moves its arms."""
+    for arm in ARMS:
+        cell.reads(arm)
+    cell.stays(cell.served.places(), 1.0)
+    assert not any(arm.motions for arm in cell.served.world.arms.values())
+    for arm in ARMS:
+        if link == "can":
+            words = controlwords(cell.relays[arm, BUS].sent[-1])
+            assert words
+            assert not any(word & 0x0F == ENABLE for word in words)
+        else:
+            order = "little" if link in ("rep", "abb") else "big"
+            assert set(messages(cell.relays[arm, MOTION].sent[-1], order)) <= ({PING} if link == "rep" else set())
+
+
+def controlwords(sent: bytes) -> list[int]:
+    """What drives were told by PDO."""
+    frames = re.findall(rb"< send 2\d\d \d+ (\w+) (\w+)", sent)
+    return [int(high + low.rjust(2, b"0"), 16) for low, high in frames]
 
 
 def messages(data: bytes, order: Literal["big", "little"] = "little") -> list[int]:

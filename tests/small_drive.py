@@ -32,6 +32,7 @@ class SmallDrive:
     window: int = 2000
     voltage: bool = True
     stiff: bool = False
+    shows_operation: int | None = None
     # What it is.
     state: int = SWITCH_ON_DISABLED
     nmt: int = 0x7F
@@ -184,7 +185,8 @@ class SmallBus:
             drive.control(word)
             self._move(drive, word, target)
         if not drive.silent:
-            self.send(0x180 + drive.node, struct.pack("<Hbi", drive.statusword(), drive.operation, drive.position))
+            shown = drive.operation if drive.shows_operation is None else drive.shows_operation
+            self.send(0x180 + drive.node, struct.pack("<Hbi", drive.statusword(), shown, drive.position))
 
     def _move(self, drive: SmallDrive, word: int, target: int) -> None:
         if drive.state != ENABLED:

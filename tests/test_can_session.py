@@ -356,6 +356,21 @@ def test_a_course_is_refused_unless_the_drives_are_enabled(arm):
         arm.link.send(arm.course((0.1, 0.0, 0.0)))
 
 
+def test_a_drive_that_comes_not_to_its_mode_is_named_and_not_left_enabled(arm, bus):
+    arm.open()
+    bus.drives[2].shows_operation = 0
+    with pytest.raises(DeviceTimeout, match=r"joint 2 \(node 2\) is operation enabled, mode 0"):
+        arm.link.enable(0.5)
+    arm.until(lambda: states(bus) == [SWITCH_ON_DISABLED] * 3)
+
+
+def test_an_arm_with_a_drive_in_another_mode_is_not_ready(enabled, bus):
+    bus.drives[2].shows_operation = 6
+    enabled.report_that(lambda report: report.mode is Mode.DISABLED)
+    with pytest.raises(CommandRefused, match=r"joint 2 \(node 2\): not in mode 8"):
+        enabled.link.send(enabled.course((0.1, 0.0, 0.0)))
+
+
 def test_a_course_that_begins_elsewhere_is_refused(enabled):
     path = JointPath(((0.2, 0.1, 0.0),), (0.5,) * 3, (4.0,) * 3)
     with pytest.raises(CommandRefused, match=r"joint 2 \(node 2\) stands at 0.0000 rad.*begins at 0.1"):

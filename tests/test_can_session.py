@@ -153,6 +153,7 @@ def test_opening_sets_drives_up_and_enables_nothing(arm, bus):
     assert [written[0x1A00, n] for n in (1, 2, 3)] == [0x60410010, 0x60610008, 0x60640020]
     assert written[0x1400, 2] == written[0x1800, 2] == 1
     assert written[0x1017, 0] == 100
+    assert written[0x605B, 0] == 1  # one that would coast when it is switched off is told to slow down
     assert written[0x6007, 0] == 3  # a drive that would do nothing when this program dies is told to stop
     master, time_ms = written[0x1016, 1] >> 16, written[0x1016, 1] & 0xFFFF
     assert (master, time_ms) == (127, 500)
@@ -258,6 +259,17 @@ def test_closing_leaves_no_drive_enabled_and_none_that_misses_a_heartbeat(enable
     for drive in bus.drives.values():
         assert drive.number(0x1016, 1) == 0
         assert drive.nmt == 0x7F
+
+
+def test_closing_within_a_move_lets_drives_come_to_rest_also_where_one_is_silent(enabled, bus):
+    enabled.move((1.5, 0.0, 0.0), speed=0.8)
+    led = bus.drives[1].targets
+    enabled.until(lambda: led[-1] - led[-2] == 160)  # counts in a cycle at that speed
+    bus.drives[2].silent = True
+    enabled.until(lambda: enabled.link._cycle.silent)
+    enabled.link.close()
+    assert led[-1] - led[-2] < 40
+    assert states(bus)[0] == SWITCH_ON_DISABLED
 
 
 def test_it_opens_again_after_it_was_closed(arm):

@@ -27,6 +27,7 @@ HEARTBEAT_LOST = 0.5
 _CIA_402 = 402
 _QUICK_STOP_AND_STAY = 6  # slow down on the quick stop ramp and hold the position
 _ON_LOSS_QUICK_STOP = 3
+_SLOW_DOWN_FIRST = 1
 _PDO_OFF = 1 << 31
 _PDO_NOT_ON_REQUEST = 1 << 30
 _EVERY_SYNC = 1
@@ -121,6 +122,9 @@ def configure(sdo: SdoNode, node: int, operation: Operation, period: float) -> D
     sdo.write(0x1017, 0, round(1000 * HEARTBEAT), 2)
     if not _optional(lambda: sdo.write(0x605A, 0, _QUICK_STOP_AND_STAY, 2, signed=True)):
         notes.append("its quick stop option (605A) cannot be set to 6")
+    if _number(sdo, 0x605B, signed=True) == 0:
+        # Where it reads 0, a drive that is switched off while it moves coasts.
+        _optional(lambda: sdo.write(0x605B, 0, _SLOW_DOWN_FIRST, 2, signed=True))
     # Where it reads 0, the loss of the heartbeat is nothing to the drive.
     unmoved = _number(sdo, 0x6007, signed=True) == 0
     if unmoved and not _optional(lambda: sdo.write(0x6007, 0, _ON_LOSS_QUICK_STOP, 2, signed=True)):

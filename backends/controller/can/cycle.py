@@ -144,12 +144,12 @@ class Cycle:
 
     @property
     def is_silent(self) -> bool:
-        """Whether a drive did not answer in the last cycle."""
-        return bool(self.silent)
+        """Whether no drive answered in the last cycle."""
+        return all(watch.silent for watch in self._watch)
 
     @property
     def silent(self) -> list[str]:
-        """Those drives."""
+        """Drives that did not answer in the last cycle."""
         return [watch.axis.name for watch in self._watch if watch.silent]
 
     @property

@@ -49,7 +49,7 @@ _TRY = 10.0  # s for finding and setting up again
 _STOP_TOLD = 0.15  # s for the cycle to take a stop, before the drives are told otherwise
 _NEAR = 0.0175  # rad within which a course must begin at the drives' positions and targets: 1 deg
 _ARRIVAL = 0.002  # rad within which a drive that says so has arrived
-_SHUT_DOWN = 1.0  # s for drives to switch off when the link is closed
+_AT_REST, _SHUT_DOWN = 1.0, 1.0  # s for drives to come to rest, and to switch off, when the link is closed
 _HIGHEST_NODE = 127
 _OPERATIONS = {"cyclic": Operation.CYCLIC_POSITION, "profile": Operation.PROFILE_POSITION}
 
@@ -129,10 +129,13 @@ class CanArmLink(ArmLink):
     def _switch_off(self, cycle: Cycle) -> None:
         """No drive is left enabled without one that leads it, and none misses this program's heartbeat."""
         cycle.stop("the link is closed", _STOP_TOLD)
-        deadline = self._clock.now() + _SHUT_DOWN
-        cycle.wait_for(lambda: not cycle.is_moving or cycle.is_silent, deadline)
+        # Where one drive is silent the others have their brake all the same.
+        cycle.wait_for(lambda: not cycle.is_moving or cycle.is_silent, self._clock.now() + _AT_REST)
         cycle.want(Goal.OFF)
-        cycle.wait_for(lambda: all(is_off(axis.state) for axis in self._axes) or cycle.is_silent, deadline)
+        cycle.wait_for(
+            lambda: all(is_off(axis.state) for axis in self._axes if axis.name not in cycle.silent),
+            self._clock.now() + _SHUT_DOWN,
+        )
         for sdo in self._sdo.values():
             try:
                 leave(sdo)

@@ -223,6 +223,7 @@ class FakeCamera:
         self.num_buffers = 0
         self.exposed: list[float] = []
         self.deaf = 0  # so many triggers bring a frame only after it is looked for twice
+        self.doubled = 0  # so many triggers bring a second frame with them
         self.damaged = 0  # so many frames do not come whole
         self.error: Exception | None = None
         self.data_format = "Mono8"
@@ -249,6 +250,9 @@ class FakeCamera:
         self.exposed.append(CLOCK.now())
         self._waiting.append((len(self.exposed) - 1, 1 if self.deaf else 0))
         self.deaf = max(0, self.deaf - 1)
+        if self.doubled:
+            self.doubled -= 1
+            self._trigger()
 
     def try_fetch(self, timeout: float) -> Any:
         assert timeout > 0
@@ -322,6 +326,15 @@ def test_the_frame_of_a_trigger_that_came_too_late_is_not_taken_for_the_next_one
     not_before = CLOCK.now()
     frame = driver.take(not_before, not_before + AMPLE)
     assert camera.exposed[int(frame.image[0, 0])] >= not_before
+
+
+def test_a_frame_that_nobody_asked_for_is_not_taken_for_the_next_one(camera: FakeCamera, driver: GenicamDriver) -> None:
+    camera.doubled = 1
+    driver.take(CLOCK.now(), CLOCK.now() + AMPLE)
+    not_before = CLOCK.now()
+    frame = driver.take(not_before, not_before + AMPLE)
+    assert camera.exposed[int(frame.image[0, 0])] >= not_before
+    assert any("not asked for" in finding.said for finding in driver.findings())
 
 
 def test_a_frame_that_did_not_come_whole_is_asked_for_again(camera: FakeCamera, driver: GenicamDriver) -> None:

@@ -26,6 +26,7 @@ from dualcal_hal.findings import Finding
 PIXELS = "Mono8"
 
 _LOOK = 0.1  # s after which a wait for a buffer looks whether it is to end
+_GLANCE = 1e-3  # s for a buffer that is there already
 _NETWORK = "check cable and network: jumbo frames, packet delay, a port of its own"
 
 
@@ -112,7 +113,7 @@ class GenicamDriver(Driver):
         self._acquirer, self._asking = acquirer, asking
         self._described, self._release = described, release
         self._ids = FrameIds()
-        self._incomplete = 0
+        self._incomplete = self._unasked = 0
         self._in_use = threading.Lock()
         self._closed = threading.Event()
 
@@ -127,12 +128,20 @@ class GenicamDriver(Driver):
             if self._clock.now() < not_before:
                 raise DeviceTimeout(self._name, "grab", "the time it is to be exposed at is later", "allow more time")
             try:
+                self._leave_none_waiting()
                 return self._whole_frame(deadline)
             except BaseException:
                 # What was asked for may still come, and must not be taken for what is asked for next.
                 with suppress(DeviceError), translated(self._name, "grab"):
                     self._asking.forget()
                 raise
+
+    def _leave_none_waiting(self) -> None:
+        """A camera that sends more than it is asked for, as by a trigger of something else, would be a frame ahead."""
+        if self._acquirer.is_acquiring() and (unasked := self._acquirer.try_fetch(timeout=_GLANCE)) is not None:
+            unasked.queue()
+            self._unasked += 1
+            self._asking.forget()
 
     def _whole_frame(self, deadline: float) -> Frame:
         """Asks again where a frame did not come whole."""
@@ -182,6 +191,9 @@ class GenicamDriver(Driver):
         found = [*self._described, Finding("proof of exposure", self._asking.said)]
         if self._incomplete:
             found.append(Finding("lost frames", f"{self._incomplete} did not come whole", "note", _NETWORK))
+        if self._unasked:
+            why = f"{self._unasked} times a frame came that was not asked for, and was thrown away"
+            found.append(Finding("trigger", why, "note", "see what else triggers it, and how many frames a trigger is"))
         return found
 
     def close(self) -> None:

@@ -99,6 +99,17 @@ def test_the_options_that_are_printed_make_it_the_cells_camera(tmp_path):
     assert "matrix: [[801.25" in (tmp_path / "camera.patch.yaml").read_text()
 
 
+@pytest.mark.parametrize("name", ["cell.yaml", "ros.yaml"])
+def test_neither_the_cell_file_nor_the_cameras_is_written_over(tmp_path, name):
+    cell, file = tmp_path / "cell.yaml", ros_file(tmp_path / "ros.yaml")
+    cell.write_text(PAPER.read_text())
+    before = (tmp_path / name).read_text()
+    result = imported(file, "--out", tmp_path / name, cell=cell)
+    assert result.exit_code == 2
+    assert f"{name}: the lines would take the place of" in result.stderr
+    assert (tmp_path / name).read_text() == before
+
+
 def test_four_coefficients_are_without_k3(tmp_path):
     camera = read_camera_file(opencv_file(tmp_path / "camera.yml", distortion=DISTORTION[:4]))
     np.testing.assert_array_equal(camera.distortion, [*DISTORTION[:4], 0.0])

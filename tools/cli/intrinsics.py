@@ -209,6 +209,8 @@ def import_intrinsics(camera_file: Path, cell: Path, out: Path | None, overrides
     """Print what another program's camera file is in a cell file, or write it to ``out``."""
     console = Screen()
     file = load_cell(cell, overrides, meshes=False, backends=False)
+    if out is not None and out.exists() and any(out.samefile(source) for source in (cell, camera_file)):
+        raise UsageError(f"{out}: the lines would take the place of what they come from or are for; name another file")
     read = read_camera_file(camera_file)
     try:
         intrinsics = read.intrinsics_for(file.cell.camera.size_px)

@@ -10,11 +10,15 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import pytest
 
+from backends.controller.joint_map import JointMap
 from backends.controller.link import ArmLink, ArmReport, Transfer
 from backends.controller.options import TcpLink
-from backends.controller.tcp import links
+from backends.controller.robot import ControlledRobot
+from backends.controller.tcp import links, port
+from backends.controller.tcp.transport import Connection
 from dualcal_hal.errors import (
     CommandRefused,
     DeviceError,
@@ -25,7 +29,8 @@ from dualcal_hal.errors import (
     NotOpen,
     UsageError,
 )
-from dualcal_hal.robot import Mode
+from dualcal_hal.limits import JointLimits
+from dualcal_hal.robot import JointPath, Mode
 from tests.tcp_servers import (
     CLOCK,
     JOINTS,
@@ -998,6 +1003,50 @@ def test_a_server_that_is_started_anew_within_a_move_is_asked_for_nothing(monkey
         _again(link)
         server.wait_for(lambda: len(server.of(1)) >= 1)
         assert {message.id for message in server.received} == {1}
+
+
+def test_a_server_that_stays_away_is_tried_less_and_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert (port.FIRST_BACK_OFF, port.LONGEST_BACK_OFF) == (0.25, 5.0)
+    monkeypatch.setattr(port, "FIRST_BACK_OFF", 0.05)
+    monkeypatch.setattr(port, "LONGEST_BACK_OFF", 0.2)
+    tried, enough, connect = [], threading.Event(), Connection.connect
+
+    def counted(self: Connection, deadline: float) -> None:
+        if self.address.port == state_port:
+            tried.append(CLOCK.now())
+            if len(tried) == 5:
+                enough.set()
+        connect(self, deadline)
+
+    with controller("rep") as server, opened(server, "rep"):
+        state_port = server.state_port
+        monkeypatch.setattr(Connection, "connect", counted)
+        begin = CLOCK.now()
+        server.close()
+        assert enough.wait(PATIENCE)
+    waits = [after - before for before, after in pairwise([begin, *tried[:5]])]
+    assert all(wait >= least for wait, least in zip(waits, (0.05, 0.1, 0.2, 0.2, 0.2), strict=True)), waits
+
+
+@pytest.mark.parametrize("dialect", ANSWERS)
+def test_a_motion_begins_where_the_newest_feedback_has_the_arm(dialect: str) -> None:
+    here, limits = (
+        [0.2, -0.3, 0.4, 0.0, 0.1, 0.5],
+        JointLimits(*(side * np.full(JOINTS, 3.0) for side in (-1, 1, 1, 1))),
+    )
+    with arm(dialect) as (link, server):
+        robot = ControlledRobot("left", limits, JointMap(None, JOINTS), CLOCK)
+        robot.attach(link)
+        server.positions[0] = list(here)
+        while newer(link).positions != pytest.approx(here):
+            pass
+        goal = tuple(angle + 0.1 for angle in here)
+        robot.start(JointPath((goal,), (0.5,) * JOINTS, (2.0,) * JOINTS)).wait(PATIENCE)
+        place = 16 if dialect == "motoman" else 4
+        first = struct.unpack_from(">10f", server.of(14 if dialect == "motoman" else 11)[0].body, place)[:JOINTS]
+        robot.detach()
+    # A stream without a time for its start begins with the end of its first piece, of at most 0.15 s.
+    assert first == pytest.approx(here, abs=0.5 * 0.15 if dialect in ("rep", "fanuc") else 1e-6)
 
 
 def test_a_motion_port_is_not_connected_anew_before_the_state_is_known() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from backends.controller.can import links
+from backends.controller.can.cycle import Cycle
 from backends.controller.course import Course
 from backends.controller.joint_map import JointMap
 from backends.controller.options import CanLink
@@ -623,6 +624,18 @@ def test_drives_stop_when_this_program_sends_no_more_heartbeats(enabled, bus):
 
 
 @pytest.mark.slow
+def test_a_failure_of_this_program_itself_is_a_lost_link_and_no_silence(enabled, monkeypatch):
+    transfer = enabled.move((1.0, 0.5, 0.3))
+
+    def failing(cycle):
+        raise RuntimeError("oh")
+
+    monkeypatch.setattr(Cycle, "_frames", failing)
+    error = enabled.failure(LinkLost, "this program failed", "oh")
+    monkeypatch.undo()
+    assert enabled.ended(transfer).error is error
+
+
 def test_a_link_that_is_lost_can_be_closed(enabled, bus):
     for drive in bus.drives.values():
         drive.dead = True

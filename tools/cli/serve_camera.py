@@ -18,7 +18,7 @@ from dualcal_hal.camera import Camera, Frame
 from dualcal_hal.cell import CAMERA_NAME, OPEN_TIMEOUT
 from dualcal_hal.cellfile import load_cell
 from dualcal_hal.clock import Clock, RealClock
-from dualcal_hal.errors import DeviceTimeout, FrameRefused, UsageError
+from dualcal_hal.errors import DeviceTimeout, FrameRefused, LinkLost, UsageError
 from dualcal_hal.registry import backend_class
 from tools.cli.exits import signals_deferred
 from tools.cli.terminal import plain
@@ -120,7 +120,7 @@ class _Service:
         newer = max(math.nextafter(self._newer_than, math.inf), 0.0)
         try:
             frame = self._camera.grab(newer, GRAB_TIMEOUT)
-        except (DeviceTimeout, FrameRefused) as error:
+        except (DeviceTimeout, FrameRefused, LinkLost) as error:  # a lost one may come back
             if str(error) != self._trouble:
                 self._trouble = str(error)
                 _say(f"no frame: {self._trouble}", error=True)

@@ -206,6 +206,10 @@ class Cycle:
                 self._run()
             except DeviceError as error:
                 self.lose(error)
+            except Exception as error:  # noqa: BLE001 - a thread that died silently would leave its arm unwatched
+                failed = LinkLost(self._device, "run the cycle", f"this program failed: {error!r}", "report it")
+                failed.__cause__ = error
+                self.lose(failed)
         with self._lock:
             if self._loss is not None:
                 self._stop_leading(self._loss)

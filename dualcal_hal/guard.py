@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -307,13 +307,16 @@ class GuardedRobot(Robot):
         motion = Motion(self.name, self._clock)
         found: list[DeviceError] = []
 
-        def alarm(error: DeviceError) -> None:
+        def alarm(error: DeviceError, told: Sequence[DeviceError]) -> None:
             found.append(error)
             # Both at once: the stop of one whose link is lost is not confirmed for a while.
             other = threading.Thread(target=_stopped, args=(bounds.other, error), name=f"stop {bounds.other.name}")
             other.start()
             _stopped(self, error)
             other.join()
+            for more in told:
+                if more is not error:  # such as the drive that did not answer, where the arm was late
+                    error.add_note(str(more))
             motion.end(MotionState.FAILED, None, error)
 
         watch = Watch(self._robot, bounds, self._clock, alarm)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +37,9 @@ _REMEMBERED = 1.0  # s
 _PERIOD_SHARE = 0.2  # of a new interval in the mean of them
 
 
+Alarm = Callable[[DeviceError, Sequence[DeviceError]], None]
+
+
 @dataclass(frozen=True)
 class Bounds:
     """What holds for one motion.
@@ -60,17 +63,18 @@ class Bounds:
 class Watch:
     """Looks at both arms until :meth:`end`; the first thing that is wrong is told to ``alarm``, on a thread of its own.
 
+    ``alarm`` also gets what the arms themselves have told, to which more may come while it stops them.
     Both arms' feedback is fresh and tells of no fault; the one that moves is on its path, keeps clearance and speed.
     """
 
-    def __init__(self, moving: Robot, bounds: Bounds, clock: Clock, alarm: Callable[[DeviceError], None]) -> None:
+    def __init__(self, moving: Robot, bounds: Bounds, clock: Clock, alarm: Alarm) -> None:
         self._moving, self._other = moving, bounds.other
         self._bounds = bounds
         self._clock = clock
         self._alarm = alarm
         self._wake = threading.Event()
         self._ended = False
-        self._failure: DeviceError | None = None
+        self._failures: list[DeviceError] = []
         self._feedback = {robot.name: _Feedback(clock.now()) for robot in (moving, bounds.other)}
         self._leave = [
             leave
@@ -88,15 +92,15 @@ class Watch:
     def _on_failure(self, error: DeviceError) -> None:
         if isinstance(error, MotionStopped):
             return  # stopped along with an arm of the same controller: whoever stopped that knows why
-        self._failure = self._failure or error
+        self._failures.append(error)
         self._wake.set()
 
     def _run(self) -> None:
         try:
             while not self._ended:
-                error = self._failure or self._look_safely()
+                error = self._failures[0] if self._failures else self._look_safely()
                 if error is not None and not self._ended:
-                    self._alarm(error)
+                    self._alarm(error, self._failures)
                     return
                 self._clock.wait(self._wake, self._clock.now() + LOOK_EVERY)
         finally:

@@ -10,7 +10,7 @@ import pytest
 from backends.controller.joint_map import JointMap
 from backends.controller.robot import ControlledRobot, OwnSpeed
 from dualcal_hal.clock import RealClock
-from dualcal_hal.errors import CommandRefused, DeviceTimeout, LinkLost, MotionFailed, MotionStopped
+from dualcal_hal.errors import CommandRefused, DeviceError, DeviceTimeout, LinkLost, MotionFailed, MotionStopped
 from dualcal_hal.geometry import CellGeometry
 from dualcal_hal.guard import CellGuard, GuardedRobot
 from dualcal_hal.limits import JointLimits
@@ -125,6 +125,23 @@ def test_what_goes_wrong_with_the_arm_that_moves_stops_both(rig, happens):
     with pytest.raises((DeviceTimeout, MotionFailed)):
         motion.wait(AMPLE)
     assert cell.links["left"].stops
+
+
+def test_what_an_arm_tells_while_it_is_stopped_is_told_with_what_it_was_stopped_for(rig):
+    cell = rig()
+    motion = cell.start("left", ASIDE)
+    link, stop = cell.links["left"], cell.links["left"].stop
+
+    def stopped(reason):
+        link.stop = stop
+        link.fail(DeviceError("left", "watch the drives", "joint 2 (node 2) emergency, code 0x8611"))
+        stop(reason)
+
+    link.stop = stopped
+    _silence(link)
+    with pytest.raises(DeviceTimeout, match="left: watch: no state for") as raised:
+        motion.wait(AMPLE)
+    assert "left: watch the drives: joint 2 (node 2) emergency, code 0x8611" in raised.value.__notes__
 
 
 def test_an_arm_off_its_path_is_stopped(rig, monkeypatch):

@@ -18,7 +18,7 @@ from procedures.estimation.refined.uncertainty import distance_quantile, spatial
 from tests.reference_cell import EXPECTED, NOMINAL_T_H_E, NOMINAL_T_P_A
 from tools.benchmarks.refined import NOISES, Verification, coverage, draw, ratios, reference
 
-RUNS = 150
+RUNS = 120
 
 
 @cache
@@ -138,18 +138,18 @@ class TestNoise:
 
     @pytest.mark.parametrize("noise", NOISES)
     def test_the_covariance_is_that_of_the_errors(self, noise: Noise) -> None:
-        """Of 150 runs: the mean of a chi-square of 12 has a sigma of 0.40, a coverage of 95 % one of 1.8 %."""
+        """Of 120 runs: the mean of a chi-square of 12 has a sigma of 0.45, a coverage of 95 % one of 2 %."""
         found = runs(noise)
-        assert found.squares.mean() == pytest.approx(12, abs=1.2)
-        assert 0.895 <= coverage(found.squares, 12) <= 0.995
-        assert 0.895 <= coverage(found.base_squares, 6) <= 0.995
+        assert found.squares.mean() == pytest.approx(12, abs=1.4)
+        assert 0.89 <= coverage(found.squares, 12) <= 0.995
+        assert 0.89 <= coverage(found.base_squares, 6) <= 0.995
         assert np.mean(found.single <= 9) >= 0.99
         assert found.costs.mean() == pytest.approx(28 * 18 - 12, rel=0.03)
 
     def test_it_holds_for_arms_a_hundred_times_less_repeatable_than_the_camera(self) -> None:
         """3 mrad, by which arms still count as linear."""
         noise = Noise(0.1, 3e-3, 3e-3)
-        found = draw(reference(), Verification.of(reference("verification")), noise, 60, seed=2)
+        found = draw(reference(), Verification.of(reference("verification")), noise, 50, seed=2)
         assert found.squares.mean() == pytest.approx(12, abs=2.5)
 
 

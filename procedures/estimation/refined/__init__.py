@@ -1,1 +1,18 @@
-"""Joint maximum likelihood of both transforms from all corners of all captures."""
+"""Joint maximum likelihood of both transforms from all corners of all captures: :func:`refined`."""
+
+from procedures.estimation.refined.data import CaptureArrays, Knowns, Noise
+from procedures.estimation.refined.estimate import Alternative, Dropped, Refined, refined
+from procedures.estimation.refined.uncertainty import Direction, Limits, SpatialError
+
+__all__ = [
+    "Alternative",
+    "CaptureArrays",
+    "Direction",
+    "Dropped",
+    "Knowns",
+    "Limits",
+    "Noise",
+    "Refined",
+    "SpatialError",
+    "refined",
+]

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import Array, Mask
+
+Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class CaptureArrays:
 
     active: Array
     passive: Array
-    arrivals: Array
+    arrivals: Indices
     pixels: Array
     order_known: Mask | None = None
     board_poses: Sequence[ArrayLike | None] | None = None
@@ -46,7 +48,7 @@ class CaptureArrays:
             arrivals=self.arrivals[chosen],
             pixels=self.pixels[chosen],
             order_known=None if self.order_known is None else self.order_known[chosen],
-            board_poses=None if poses is None else [poses[i] for i in np.flatnonzero(chosen)],
+            board_poses=None if poses is None else [pose for pose, kept in zip(poses, chosen, strict=True) if kept],
         )
 
     def turned(self, flipped: Mask) -> CaptureArrays:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dualcal_hal.transforms import Array
 from procedures.estimation.refined.model import Linearised, Model, State
 
 MOST_STEPS = 60
@@ -30,10 +31,12 @@ class Fit:
 def minimise(model: Model, state: State, damping: float = 1e-4, most_steps: int = MOST_STEPS) -> Fit:
     """From a state in which all seen corners are in front of the camera, else the cost stays infinite."""
     at = model.linearised(state)
+    if not np.isfinite(at.cost):
+        return Fit(state, replace(at, cost=np.inf), False, 0)
     for step in range(1, most_steps + 1):
         scale = np.diag(at.normal) + 1e-12 * np.trace(at.normal)
         try:
-            change = np.linalg.solve(at.normal + damping * np.diag(scale), -at.gradient)
+            change = _solved(at.normal + damping * np.diag(scale), -at.gradient)
         except np.linalg.LinAlgError:
             return Fit(state, at, False, step)
         tried = model.stepped(state, at, change)
@@ -48,3 +51,7 @@ def minimise(model: Model, state: State, damping: float = 1e-4, most_steps: int 
             if not damping < _MOST_DAMPING:
                 return Fit(state, at, False, step)
     return Fit(state, at, False, most_steps)
+
+
+def _solved(normal: Array, right: Array) -> Array:
+    return np.asarray(np.linalg.solve(normal, right), dtype=float)

@@ -14,7 +14,7 @@ import numpy as np
 
 from dualcal_hal.transforms import Array, Mask, apply, inverse, skew
 from procedures.estimation.projection import project, project_with_jacobian
-from procedures.estimation.refined.data import CaptureArrays, Knowns, Noise
+from procedures.estimation.refined.data import CaptureArrays, Indices, Knowns, Noise
 from procedures.estimation.refined.motion import adjoint, in_flange, moved
 
 CELL = 12
@@ -38,10 +38,10 @@ class Linearised:
     """At a state: cost, a sum of squares in units of sigma; normal (12, 12) and gradient (12,) of the cell with all
     errors of the arms marginalised.
 
-    Per capture: pixel_normal (k, 6, 6) and pixel_gradient (k, 6) on T_P_E from the pixels alone, capture_normal
-    (k, 6, 6) with the passive arm marginalised, squares (k,) of pixels in units of sigma. Per arrival: arrival_normal
-    (a, 6, 6), the sum of those, pose_normal (a, 6, 6) with the active arm marginalised too. towards_cell (a, 6, 12):
-    how the cell moves T_P_E; towards_active (a, 6, na) and towards_passive (k, 6, np): how the arms do, by a sigma.
+    Normals (., 6, 6) and gradients (., 6) are on T_P_E: pixel, of each capture from its pixels alone; capture, with the
+    passive arm marginalised; arrival, their sum over one; pose, with the active arm marginalised too. squares (k,): of
+    pixels in units of sigma. towards_cell (a, 6, 12): how the cell moves T_P_E; towards_active (a, 6, na) and
+    towards_passive (k, 6, np): how the arms do, by a sigma; gains and steps: how their errors follow (marginalised).
     """
 
     cost: float
@@ -51,9 +51,11 @@ class Linearised:
     pixel_normal: Array
     pixel_gradient: Array
     capture_normal: Array
+    capture_gradient: Array
     arrival_normal: Array
     arrival_gradient: Array
     pose_normal: Array
+    pose_gradient: Array
     towards_cell: Array
     towards_active: Array
     towards_passive: Array
@@ -61,6 +63,18 @@ class Linearised:
     passive_step: Array
     active_gain: Array
     active_step: Array
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What corners say of T_P_E, passive arm as it is: squares (b,), their sum in units of sigma; normal (b, 6, 6),
+    gradient (b, 6); towards_passive (b, 6, np): how T_P_E would have to move for a sigma of the passive arm.
+    """
+
+    squares: Array
+    normal: Array
+    gradient: Array
+    towards_passive: Array
 
 
 class Model:
@@ -73,13 +87,13 @@ class Model:
         labels, first, arrival = np.unique(data.arrivals, return_index=True, return_inverse=True)
         rank = np.argsort(np.argsort(first))
         self.labels = labels[np.argsort(first)]
-        self.arrival: Array = rank[arrival.ravel()]
+        self.arrival: Indices = rank[arrival.ravel()]
         self.active = arrival_readings(data.active, self.arrival, len(labels))
         self.T_A_H = knowns.active.forward(self.active)
         self.T_P_F = knowns.passive.forward(data.passive)
         self.J_active = in_flange(knowns.active.jacobian(self.active), self.T_A_H)
         self.J_passive = in_flange(knowns.passive.jacobian(data.passive), self.T_P_F)
-        self.seen: Mask = np.isfinite(data.pixels).all(axis=-1)
+        self.seen: Mask = np.asarray(np.isfinite(data.pixels).all(axis=-1))
         self.pixels = np.where(self.seen[..., None], data.pixels, 0.0)
 
     @property
@@ -89,6 +103,11 @@ class Model:
     @property
     def captures(self) -> int:
         return len(self.pixels)
+
+    @property
+    def freedom(self) -> Array:
+        """(k,): numbers measured in each capture, two for each corner."""
+        return np.asarray(2.0 * self.seen.sum(axis=1))
 
     @property
     def measurements(self) -> int:
@@ -112,42 +131,29 @@ class Model:
 
     def linearised(self, state: State) -> Linearised:
         T_E_P, T_E_T = self._target_in_camera(state)
-        in_camera = apply(T_E_T, self.knowns.corners)
-        pixels, J_pixel = project_with_jacobian(in_camera, self.knowns.matrix, self.knowns.distortion)
-        # A motion (v, w) of T_P_E moves a point's coordinates p in the camera by -v + p x w.
-        J = np.concatenate([-J_pixel, J_pixel @ skew(in_camera)], axis=-1) / self.noise.pixel
-        J = np.where(self.seen[..., None, None], J, 0.0).reshape(self.captures, -1, 6)
-        r = self._whitened(pixels).reshape(self.captures, -1)
-        J_T = np.swapaxes(J, 1, 2)
-        L, g = J_T @ J, (J_T @ r[..., None])[..., 0]
-
-        # From the target on its flange to the camera: the passive arm moves T_P_E the other way.
-        T_E_F = T_E_T @ inverse(self.knowns.T_F_T)
-        P = -self.noise.passive * adjoint(T_E_F) @ self.J_passive
-        W, gw, passive_gain, passive_step = _marginalised(L, g, P, state.passive)
+        sight = self.sight(T_E_T)
+        L, g, P = sight.normal, sight.gradient, sight.towards_passive
+        W, gw, passive_gain, passive_step = marginalised(L, g, P, state.passive)
         arrival_normal, arrival_gradient = self._summed(W), self._summed(gw)
 
-        T_E_H = inverse(state.T_H_E)
-        A = self.noise.active * adjoint(T_E_H) @ self.J_active
-        pose_normal, pose_gradient, active_gain, active_step = _marginalised(
+        G, A = self._moves(state, T_E_P)
+        pose_normal, pose_gradient, active_gain, active_step = marginalised(
             arrival_normal, arrival_gradient, A, state.active
         )
-        G = np.empty((self.arrivals, 6, CELL))
-        G[:, :, :6] = adjoint(T_E_P @ state.T_P_A)
-        G[:, :, 6:] = np.eye(6)
         G_T = np.swapaxes(G, 1, 2)
-        squares = np.sum(r**2, axis=1)
         return Linearised(
-            cost=float(squares.sum() + np.sum(state.active**2) + np.sum(state.passive**2)),
+            cost=float(sight.squares.sum() + np.sum(state.active**2) + np.sum(state.passive**2)),
             normal=np.sum(G_T @ pose_normal @ G, axis=0),
             gradient=np.sum((G_T @ pose_gradient[..., None])[..., 0], axis=0),
-            squares=squares,
+            squares=sight.squares,
             pixel_normal=L,
             pixel_gradient=g,
             capture_normal=W,
+            capture_gradient=gw,
             arrival_normal=arrival_normal,
             arrival_gradient=arrival_gradient,
             pose_normal=pose_normal,
+            pose_gradient=pose_gradient,
             towards_cell=G,
             towards_active=A,
             towards_passive=P,
@@ -156,6 +162,39 @@ class Model:
             active_gain=active_gain,
             active_step=active_step,
         )
+
+    def sight(self, T_E_T: Array, which: Indices | None = None, flipped: Mask | None = None) -> Sight:
+        """Of boards T_E_T (b, 4, 4) where captures ``which`` (b,) saw theirs, all of them in order if None; the corners
+        of the captures where ``flipped`` (b,) is True are listed from the other end.
+        """
+        pixels, seen, J_passive = self.pixels, self.seen, self.J_passive
+        if which is not None:
+            pixels, seen, J_passive = pixels[which], seen[which], J_passive[which]
+        if flipped is not None:
+            pixels = np.where(flipped[:, None, None], pixels[:, ::-1], pixels)
+            seen = np.where(flipped[:, None], seen[:, ::-1], seen)
+        in_camera = apply(T_E_T, self.knowns.corners)
+        found, J_pixel = project_with_jacobian(in_camera, self.knowns.matrix, self.knowns.distortion)
+        # A motion (v, w) of T_P_E moves a point's coordinates p in the camera by -v + p x w.
+        J = np.concatenate([-J_pixel, J_pixel @ skew(in_camera)], axis=-1)
+        J = (np.where(seen[..., None, None], J, 0.0) / self.noise.pixel).reshape(len(T_E_T), -1, 6)
+        r = (np.where(seen[..., None], found - pixels, 0.0) / self.noise.pixel).reshape(len(T_E_T), -1)
+        J_T = np.swapaxes(J, 1, 2)
+        # From the target on its flange to the camera: the passive arm moves T_P_E the other way.
+        T_E_F = T_E_T @ inverse(self.knowns.T_F_T)
+        return Sight(
+            squares=np.sum(r**2, axis=1),
+            normal=J_T @ J,
+            gradient=(J_T @ r[..., None])[..., 0],
+            towards_passive=-self.noise.passive * adjoint(T_E_F) @ J_passive,
+        )
+
+    def arrival_poses(self, state: State) -> tuple[Array, Array, Array]:
+        """T_P_E of the arrivals (a, 4, 4), and how the cell (a, 6, 12) and a sigma of the active arm (a, 6, na) move
+        them.
+        """
+        T_E_P, _ = self._target_in_camera(state)
+        return inverse(T_E_P), *self._moves(state, T_E_P)
 
     def stepped(self, state: State, at: Linearised, step: Array) -> State:
         """The state after the cell has moved by ``step`` (12,), with the arms' errors where they then fit best."""
@@ -169,6 +208,12 @@ class Model:
             active=state.active + active_step,
             passive=state.passive + passive_step,
         )
+
+    def _moves(self, state: State, T_E_P: Array) -> tuple[Array, Array]:
+        G = np.empty((self.arrivals, 6, CELL))
+        G[:, :, :6] = adjoint(T_E_P @ state.T_P_A)
+        G[:, :, 6:] = np.eye(6)
+        return G, self.noise.active * adjoint(inverse(state.T_H_E)) @ self.J_active
 
     def _target_in_camera(self, state: State) -> tuple[Array, Array]:
         """T_E_P of the arrivals (a, 4, 4), T_E_T of the captures (k, 4, 4)."""
@@ -186,14 +231,14 @@ class Model:
         return total
 
 
-def arrival_readings(active: Array, arrival: Array, arrivals: int) -> Array:
+def arrival_readings(active: Array, arrival: Indices, arrivals: int) -> Array:
     """(a, na): the median of the active joints (k, na) over the captures of each arrival; arrival (k,) from 0."""
     if np.bincount(arrival, minlength=arrivals).max(initial=0) <= 1:
         return active[np.argsort(arrival)]
     return np.stack([np.median(active[arrival == a], axis=0) for a in range(arrivals)])
 
 
-def _marginalised(normal: Array, gradient: Array, towards: Array, errors: Array) -> tuple[Array, Array, Array, Array]:
+def marginalised(normal: Array, gradient: Array, towards: Array, errors: Array) -> tuple[Array, Array, Array, Array]:
     """Information (b, 6, 6) and gradient (b, 6) on a pose without the errors (b, n), of unit sigma, that move it by
     ``towards`` (b, 6, n); and how the errors follow: by ``step - gain @ motion of the pose``.
     """

@@ -83,9 +83,8 @@ class SpatialError:
 def spatial_error(T_P_A: Array, covariance: Array, points: ArrayLike) -> SpatialError:
     """At points (..., 3) of P, m; both fields (...)."""
     spread = point_covariance(T_P_A, covariance, points)
-    return SpatialError(
-        rms=np.sqrt(np.trace(spread, axis1=-2, axis2=-1)), p95=distance_quantile(np.linalg.eigvalsh(spread), 0.95)
-    )
+    variances: Array = np.asarray(np.linalg.eigvalsh(spread), dtype=float)
+    return SpatialError(rms=np.sqrt(variances.sum(axis=-1)), p95=distance_quantile(variances, 0.95))
 
 
 def distance_quantile(variances: Array, probability: float) -> Array:

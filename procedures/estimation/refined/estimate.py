@@ -1,0 +1,376 @@
+"""Both transforms by joint maximum likelihood, with what they are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from dualcal_hal.transforms import Array, Mask
+from procedures.estimation.degenerate import Degenerate
+from procedures.estimation.refined.data import CaptureArrays, Indices, Knowns, Noise
+from procedures.estimation.refined.fit import Fit, minimise
+from procedures.estimation.refined.geometry import refuse_few, refuse_one_axis
+from procedures.estimation.refined.model import CELL, Model
+from procedures.estimation.refined.motion import motion_between
+from procedures.estimation.refined.outliers import (
+    Distances,
+    between_arrivals,
+    distances,
+    limits,
+    predicted_distances,
+)
+from procedures.estimation.refined.start import Start, camera_candidates, starts
+from procedures.estimation.refined.uncertainty import (
+    Direction,
+    Limits,
+    SpatialError,
+    condition,
+    directions,
+    spatial_error,
+)
+
+SECOND = 1.5
+"""A second solution that costs at most so many times what the best one does is told of."""
+
+# Captures of one arrival whose active readings differ by more than this are taken for two arrivals.
+_APART = 5e-3  # rad
+
+_SUSPICIOUS = 4.0  # squares this many times larger than the noise says: perhaps not the right optimum
+_MOST_ROUNDS = 12
+_SIGNIFICANT = 1e-3
+_LARGE = 0.005  # m; a predicted sigma above it is warned of
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A capture, by its index, that is not used, and why; distance: from where the others put it, in sigmas rms."""
+
+    capture: int
+    reason: str
+    distance: float
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another optimum, (4, 4) each, and its cost over the best one's."""
+
+    T_P_A: Array
+    T_H_E: Array
+    ratio: float
+
+
+@dataclass(frozen=True)
+class Refined:
+    """T_P_A, T_H_E (4, 4); covariance (12, 12) of error = log(T_est^-1 T_true), translation (m) then rotation (rad) in
+    the child frame, of T_P_A then of T_H_E.
+
+    directions: of these twelve; condition: of the whitened problem. cost: sum of squares in units of sigma, of
+    ``freedom`` degrees of freedom; between and between_freedom: the part in which the arrivals differ from one cell.
+    scale: what the covariance of the stated noise was multiplied by since the data show more, 1 if they do not.
+    residuals (k, n, 2): pixels in units of sigma, NaN for corners not seen and captures not used; distances (k,):
+    squared Mahalanobis distance of each capture from where the others put it, NaN for those not used; freedoms (k,):
+    its degrees of freedom. flipped (k,): captures taken with their corners from the other end. used (k,).
+    """
+
+    T_P_A: Array
+    T_H_E: Array
+    covariance: Array
+    directions: tuple[Direction, ...]
+    condition: float
+    cost: float
+    freedom: int
+    between: float
+    between_freedom: int
+    scale: float
+    residuals: Array
+    distances: Array
+    freedoms: Array
+    used: Mask
+    flipped: Mask
+    dropped: tuple[Dropped, ...]
+    alternatives: tuple[Alternative, ...]
+    warnings: tuple[str, ...]
+
+    def spatial_error(self, points: ArrayLike) -> SpatialError:
+        """Predicted at points (..., 3) of the passive base, m."""
+        return spatial_error(self.T_P_A, self.covariance, points)
+
+
+def refined(
+    data: CaptureArrays,
+    knowns: Knowns,
+    noise: Noise,
+    *,
+    further_starts: Sequence[tuple[ArrayLike, ArrayLike]] = (),
+    keep_all: bool = False,
+    observable: Limits | None = None,
+) -> Refined:
+    """Estimate T_P_A and T_H_E from captures alone.
+
+    further_starts: pairs of T_P_A and T_H_E, such as the nominal ones, tried besides those found from the captures.
+    keep_all: no capture is dropped however badly it fits. Raises Degenerate for captures that do not determine both
+    transforms.
+    """
+    data = replace(data, arrivals=_by_reading(data))
+    every = Model(data, knowns, noise)
+    usable = every.seen.sum(axis=1) > 0
+    reached = np.unique(every.arrival[usable])
+    refuse_few(len(reached))
+    candidates = camera_candidates(every, data.order, data.board_poses, False)
+    refuse_one_axis(every.T_A_H[reached], candidates.optical_axes, noise.active)
+    everybody = np.ones(len(data), dtype=bool)
+    further = [
+        Start(np.asarray(T_P_A, dtype=float), np.asarray(T_H_E, dtype=float), ~everybody, np.inf, everybody)
+        for T_P_A, T_H_E in further_starts
+    ]
+    search = _Search(data, every, usable, keep_all)
+    solutions = search.solutions(starts(every, candidates, False), False)
+    if not solutions or search.suspicious(solutions[0]):
+        candidates = camera_candidates(every, data.order, data.board_poses, True)
+        solutions += search.solutions(starts(every, candidates, True) + further, True)
+        solutions = _best_first(solutions)
+    if not solutions:
+        raise Degenerate(
+            "no cell explains the captures, even roughly: see that arms, camera and target are the right ones"
+        )
+    best = solutions[0]
+    axes = best.model.arrival_poses(best.fit.state)[0][:, :3, 2]
+    warnings = refuse_one_axis(best.model.T_A_H, axes, noise.active)
+    return _result(search, best, _alternatives(best, solutions[1:]), warnings, observable or Limits())
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """A fit to the captures ``used`` (k,), those ``flipped`` (k,) from the other end of their corners; loss: how far
+    all captures are off, by the logarithm, so that those which do not belong hardly count.
+    """
+
+    model: Model
+    fit: Fit
+    used: Mask
+    flipped: Mask
+    distances: Distances
+    loss: float
+
+
+@dataclass(frozen=True)
+class _Search:
+    data: CaptureArrays
+    every: Model
+    usable: Mask
+    keep_all: bool
+
+    def solutions(self, found: Sequence[Start], only_fitting: bool) -> list[_Solution]:
+        """From all starts, best first; only_fitting: at first with the captures that fit the start."""
+        results = []
+        for start in found:
+            used = self.usable & start.fits if only_fitting and not self.keep_all else self.usable
+            solution = self._fitted(start.T_P_A, start.T_H_E, used, start.flipped)
+            if solution is not None:
+                results.append(solution if self.keep_all else self._trimmed(solution))
+        return _best_first(results)
+
+    def suspicious(self, solution: _Solution) -> bool:
+        """Whether another start may do better."""
+        dropped = not np.array_equal(solution.used, self.usable)
+        return dropped or max(solution.distances.scale()) > _SUSPICIOUS or not solution.fit.converged
+
+    def _fitted(self, T_P_A: Array, T_H_E: Array, used: Mask, flipped: Mask) -> _Solution | None:
+        if len(np.unique(self.every.arrival[used])) < 3:
+            return None
+        model = Model(self.data.turned(flipped).only(used), self.every.knowns, self.every.noise)
+        fit = minimise(model, model.state(T_P_A, T_H_E))
+        if not np.isfinite(fit.at.cost):
+            return None
+        try:
+            off = distances(model, fit)
+            predicted = predicted_distances(model, self.every, fit, flipped) if not used.all() else np.empty(len(used))
+        except np.linalg.LinAlgError:
+            return None
+        predicted[used] = off.captures
+        apart = np.log1p(np.minimum(predicted / np.maximum(self.every.freedom, 1), 1e12))
+        return _Solution(model, fit, used, flipped, off, float(apart[self.usable].sum()))
+
+    def _trimmed(self, solution: _Solution) -> _Solution:
+        """Without what does not fit, and with all that does."""
+        seen_before = [solution.used]
+        for _ in range(_MOST_ROUNDS):
+            used, flipped = self._judged(solution)
+            if np.array_equal(used, solution.used) and np.array_equal(flipped[used], solution.flipped[used]):
+                break
+            again = self._fitted(solution.fit.state.T_P_A, solution.fit.state.T_H_E, used, flipped)
+            if again is None:
+                break
+            solution = again
+            if any(np.array_equal(used, before) for before in seen_before):
+                break
+            seen_before.append(used)
+        return solution
+
+    def _judged(self, solution: _Solution) -> tuple[Mask, Mask]:
+        of_captures, of_arrivals = solution.distances.scale()
+        used = solution.used.copy()
+        mine = np.flatnonzero(used)
+        worst = _worst(solution, of_captures, of_arrivals)
+        used[mine[worst]] = False
+        flipped = solution.flipped.copy()
+        # What was left out so far comes back where it fits.
+        freedom = self.every.freedom
+        scale = max(of_captures, of_arrivals)
+        predicted = predicted_distances(solution.model, self.every, solution.fit, flipped)
+        other = predicted_distances(solution.model, self.every, solution.fit, ~flipped)
+        turn = ~solution.used & ~self.data.order & (other < predicted)
+        flipped = flipped ^ turn
+        predicted = np.where(turn, other, predicted)
+        if not worst.any():
+            used |= self.usable & (predicted < limits(freedom, scale))
+        return used, flipped
+
+
+def _best_first(solutions: Sequence[_Solution]) -> list[_Solution]:
+    """By their loss, but of those with the captures of the best one the cheapest first."""
+    ordered = sorted(solutions, key=lambda solution: solution.loss)
+    alike = [solution for solution in ordered if np.array_equal(solution.used, ordered[0].used)]
+    others = [solution for solution in ordered if not np.array_equal(solution.used, ordered[0].used)]
+    return sorted(alike, key=lambda solution: solution.fit.at.cost) + others
+
+
+def _worst(solution: _Solution, of_captures: float, of_arrivals: float) -> Mask:
+    """Of the captures used, those to go next: the worst first, since it draws the others away too."""
+    d, arrival = solution.distances, solution.model.arrival
+    over = d.captures / limits(d.freedom, of_captures)
+    whole = d.arrivals / limits(np.full(len(d.arrivals), 6.0), of_arrivals)
+    # An arrival whose captures agree with each other is wrong as a whole.
+    agree = d.within <= limits(d.within_freedom, of_captures)
+    whole = np.where(agree, whole, 0.0)
+    if whole.max() > 1 and not np.any((over > 1) & ~agree[arrival]):
+        return np.asarray(arrival == np.argmax(whole))
+    apart = np.where(agree[arrival] & (whole[arrival] > 1), 0.0, over)
+    return np.asarray((apart > 1) & (apart >= apart.max()))
+
+
+def _by_reading(data: CaptureArrays) -> Indices:
+    """(k,): numbers of arrivals, such that an arrival's active readings agree."""
+    numbers = np.empty(len(data), dtype=np.intp)
+    count = 0
+    for label in dict.fromkeys(data.arrivals.tolist()):
+        left = np.flatnonzero(data.arrivals == label)
+        while len(left):
+            middle = np.median(data.active[left], axis=0)
+            nearest = left[np.argmin(np.abs(data.active[left] - middle).max(axis=1))]
+            near = np.abs(data.active[left] - data.active[nearest]).max(axis=1) < _APART
+            numbers[left[near]] = count
+            count, left = count + 1, left[~near]
+    return numbers
+
+
+def _alternatives(best: _Solution, others: Sequence[_Solution]) -> tuple[Alternative, ...]:
+    found: list[Alternative] = []
+    cost = max(best.fit.at.cost, 1e-12)
+    for other in others:
+        fewer = int(other.used.sum()) < int(best.used.sum())
+        ratio = other.fit.at.cost / cost
+        known = [(best.fit.state.T_P_A, best.fit.state.T_H_E), *((a.T_P_A, a.T_H_E) for a in found)]
+        if not fewer and ratio < SECOND and all(_elsewhere(best, other, *cell) for cell in known):
+            found.append(Alternative(other.fit.state.T_P_A, other.fit.state.T_H_E, float(ratio)))
+    return tuple(found)
+
+
+def _elsewhere(best: _Solution, other: _Solution, T_P_A: Array, T_H_E: Array) -> bool:
+    """Whether another solution is more than three sigma, and more than rounding, from a cell."""
+    state = other.fit.state
+    d = np.concatenate([motion_between(T_P_A, state.T_P_A), motion_between(T_H_E, state.T_H_E)])
+    return bool(d @ best.fit.at.normal @ d > 9 and np.abs(d).max() > 1e-6)
+
+
+def _result(
+    search: _Search,
+    best: _Solution,
+    alternatives: tuple[Alternative, ...],
+    warnings: tuple[str, ...],
+    observable: Limits,
+) -> Refined:
+    model, fit, used = best.model, best.fit, best.used
+    freedom = model.measurements - CELL
+    between, between_freedom = between_arrivals(fit)
+    scale = max(_excess(fit.at.cost, freedom), _excess(between, between_freedom))
+    covariance: Array = np.asarray(scale * np.linalg.inv(fit.at.normal), dtype=float)
+    found = directions(covariance, observable)
+    k, n = search.every.seen.shape
+    residuals, squares = np.full((k, n, 2), np.nan), np.full(k, np.nan)
+    residuals[used] = np.where(model.seen[..., None], model.residuals(fit.state), np.nan)
+    squares[used] = best.distances.captures
+    return Refined(
+        T_P_A=fit.state.T_P_A,
+        T_H_E=fit.state.T_H_E,
+        covariance=covariance,
+        directions=found,
+        condition=condition(fit.at.normal),
+        cost=fit.at.cost,
+        freedom=freedom,
+        between=between,
+        between_freedom=between_freedom,
+        scale=scale,
+        residuals=residuals,
+        distances=squares,
+        freedoms=search.every.freedom,
+        used=used,
+        flipped=best.flipped,
+        dropped=_dropped(search, best),
+        alternatives=alternatives,
+        warnings=(*warnings, *_warnings(fit, found, scale, alternatives)),
+    )
+
+
+def _excess(squares: float, freedom: int) -> float:
+    """By what squares exceed those of the stated noise; 1 if that may be chance."""
+    if freedom <= 0 or stats.chi2.sf(squares, freedom) > _SIGNIFICANT:
+        return 1.0
+    return max(1.0, squares / freedom)
+
+
+def _warnings(fit: Fit, found: Sequence[Direction], scale: float, alternatives: Sequence[Alternative]) -> list[str]:
+    words = []
+    if not fit.converged:
+        words.append("the estimate has not converged")
+    large = [d for d in found if d.name.startswith("translation") and d.sigma > _LARGE]
+    if large:
+        names = ", ".join(f"{d.name} by {1e3 * d.sigma:.1f} mm" for d in large)
+        words.append(f"uncertain (1 sigma): {names}; captures with the active flange turned further would help")
+    hidden = [d.name for d in found if not d.observable and d not in large]
+    if hidden:
+        words.append(f"not observable: {', '.join(hidden)}")
+    if scale > 1:
+        words.append(
+            f"residuals are {np.sqrt(scale):.1f} times what the stated noise explains; the covariance is widened"
+        )
+    words += [f"a second solution costs only {alternative.ratio:.2f} times as much" for alternative in alternatives]
+    return words
+
+
+def _dropped(search: _Search, best: _Solution) -> tuple[Dropped, ...]:
+    gone = np.flatnonzero(search.usable & ~best.used)
+    unseen = [Dropped(int(k), "no corner was seen", np.nan) for k in np.flatnonzero(~search.usable)]
+    if not len(gone):
+        return tuple(unseen)
+    every = search.every
+    freedom = np.maximum(every.freedom, 1)
+    predicted = predicted_distances(best.model, every, best.fit, best.flipped)
+    turned = predicted_distances(best.model, every, best.fit, ~best.flipped)
+    reached = limits(freedom, max(best.distances.scale()))
+    named = []
+    for k in gone:
+        sigmas = float(np.sqrt(predicted[k] / freedom[k]))
+        together = (every.arrival == every.arrival[k]) & search.usable
+        if turned[k] < reached[k]:
+            reason = "its corners are listed from the other end"
+        elif together.sum() > 1 and not best.used[together].any():
+            reason = "all captures of its arrival are off: the active arm stood elsewhere than it was read"
+        else:
+            reason = f"{sigmas:.0f} sigma (rms) from where the other captures put it"
+        named.append(Dropped(int(k), reason, sigmas))
+    return (*unseen, *named)

@@ -1,0 +1,310 @@
+"""First values without a nominal: the camera's pose at each arrival, then both transforms in closed form.
+
+The captures of an arrival have known places in P, so together they are one target that is not plane. Poses are refined
+within their arrival with captures that do not fit weighed down, then the cell is, with arrivals that do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dualcal_hal.transforms import Array, Mask, apply, inverse, rotation_angle
+from procedures.estimation.projection import undistort
+from procedures.estimation.refined.closed_form import solve
+from procedures.estimation.refined.data import Indices
+from procedures.estimation.refined.model import Model, marginalised
+from procedures.estimation.refined.motion import adjoint, motion_between, moved
+from procedures.estimation.refined.resection import camera_poses, plane_poses, resect
+
+# How far off, in sigmas rms, a capture or an arrival may be without being weighed down, step by step: a first value is
+# far from what all agree on, and at the end only those that fit should decide.
+_POSE_SCALES = (100.0, 30.0, 10.0, 5.0, 3.0)
+_CELL_SCALES = (100.0, 30.0, 10.0, 5.0, 3.0, 3.0, 3.0)
+
+_MOST_POSES = 3  # kept of an arrival
+_SAME_TURN, _SAME_PLACE = np.radians(1.0), 0.01
+_WORSE = 3.0  # a pose whose captures are this much farther off in the logarithm of their squares is not kept
+_FEWEST_SETS, _MOST_PAIRS = 20, 1000  # sets of three arrivals, and their comparisons with all poses
+_MOST_STARTS = 6
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Candidates for T_P_E (c, 4, 4) of arrivals (c,); loss (c,); normal (c, 6, 6): information on it from captures
+    that fit; flipped (c, k): captures that fit it from the other end of their corners; weights (c, k) of the captures,
+    0 for those of other arrivals.
+    """
+
+    arrival: Indices
+    T_P_E: Array
+    loss: Array
+    normal: Array
+    flipped: Mask
+    weights: Array
+
+    @property
+    def optical_axes(self) -> Array:
+        """(., 3): directions in P, of each arrival's best candidate."""
+        return self.T_P_E[np.unique(self.arrival, return_index=True)[1], :3, 2]
+
+    def only(self, chosen: Indices) -> Poses:
+        return Poses(
+            self.arrival[chosen],
+            self.T_P_E[chosen],
+            self.loss[chosen],
+            self.normal[chosen],
+            self.flipped[chosen],
+            self.weights[chosen],
+        )
+
+
+@dataclass(frozen=True)
+class Start:
+    """T_P_A, T_H_E (4, 4); flipped (k,): captures whose corners are then listed from the other end; loss: how badly
+    the arrivals fit; fits (k,): captures that do.
+    """
+
+    T_P_A: Array
+    T_H_E: Array
+    flipped: Mask
+    loss: float
+    fits: Mask
+
+
+def camera_candidates(
+    model: Model, order_known: Mask, board_poses: Sequence[ArrayLike | None] | None, thorough: bool
+) -> Poses:
+    """Poses of the camera at each arrival. Thorough: from each capture's board alone too, for arrivals whose captures
+    do not fit together; else only for those with unknown order or a single capture.
+    """
+    T_P_T = model.T_P_F @ model.knowns.T_F_T
+    rays, seen = _rays(model)
+    seen &= np.isfinite(rays).all(axis=-1)
+    arrival, T_P_E = _together(model, T_P_T, rays, seen)
+    together = np.bincount(model.arrival[seen.sum(axis=1) >= 4], minlength=model.arrivals)
+    unsure = np.bincount(model.arrival[~order_known], minlength=model.arrivals) > 0
+    alone = np.flatnonzero((seen.sum(axis=1) >= 4) & (thorough | (together < 2) | unsure)[model.arrival])
+    if len(alone):
+        boards = plane_poses(model.knowns.corners, rays[alone], seen[alone])
+        for poses in (boards, boards[~order_known[alone]] @ _HALF_TURN):
+            of = alone if len(poses) == len(alone) else alone[~order_known[alone]]
+            arrival = np.concatenate([arrival, np.repeat(model.arrival[of], 2)])
+            T_P_E = np.concatenate([T_P_E, camera_poses(T_P_T[of][:, None], poses).reshape(-1, 4, 4)])
+    for k, pose in enumerate(board_poses or ()):
+        if pose is not None and thorough | (together < 2)[model.arrival[k]]:
+            given = np.asarray(pose, dtype=float).reshape(-1, 4, 4)
+            arrival = np.concatenate([arrival, np.repeat(model.arrival[k], len(given))])
+            T_P_E = np.concatenate([T_P_E, camera_poses(T_P_T[k], given)])
+    return _distinct(model, _agreed(model, T_P_T, order_known, arrival, T_P_E))
+
+
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def _rays(model: Model) -> tuple[Array, Mask]:
+    """(k, n, 2) normalised undistorted, NaN where there is no such point, and which corners were seen."""
+    seen = model.seen.copy()
+    centre = model.knowns.matrix[:2, 2]
+    pixels = np.where(seen[..., None], model.pixels, centre)
+    try:
+        return undistort(pixels, model.knowns.matrix, model.knowns.distortion), seen
+    except ValueError:
+        rays = np.full(pixels.shape, np.nan)
+        for k, corners in enumerate(pixels):
+            try:
+                rays[k] = undistort(corners, model.knowns.matrix, model.knowns.distortion)
+            except ValueError:
+                continue
+        return rays, seen
+
+
+def _together(model: Model, T_P_T: Array, rays: Array, seen: Mask) -> tuple[Indices, Array]:
+    """T_P_E of the arrivals with at least two captures, from all their corners at once."""
+    usable = np.bincount(model.arrival[seen.sum(axis=1) >= 4], minlength=model.arrivals) >= 2
+    places = apply(T_P_T, model.knowns.corners)
+    T_E_P = resect(places, np.where(seen[..., None], rays, 0.0), seen.astype(float), model.arrival, model.arrivals)
+    return np.flatnonzero(usable), inverse(T_E_P[usable])
+
+
+def _agreed(model: Model, T_P_T: Array, order_known: Mask, arrival: Indices, T_P_E: Array) -> Poses:
+    """Poses refined on the captures of their arrival."""
+    pairs = np.argwhere(arrival[:, None] == model.arrival[None])
+    of, which = pairs[:, 0], pairs[:, 1]
+    unsure = np.flatnonzero(~order_known[which])
+    freedom = 2.0 * model.seen.sum(axis=1)[which]
+    flipped = np.zeros(len(which), dtype=bool)
+    for scale in (*_POSE_SCALES, None):
+        T_E_T = inverse(T_P_E)[of] @ T_P_T[which]
+        squares, normal, gradient = _sights(model, T_E_T, which, flipped)
+        if len(unsure):
+            other = _sights(model, T_E_T[unsure], which[unsure], ~flipped[unsure])
+            better = other[0] < squares[unsure]
+            for mine, its in zip((squares, normal, gradient), other, strict=True):
+                mine[unsure[better]] = its[better]
+            flipped[unsure[better]] = ~flipped[unsure[better]]
+        off = squares / np.maximum(freedom, 1)
+        weights = 1 / (1 + off / (scale or _POSE_SCALES[-1]) ** 2)
+        summed = np.zeros((len(T_P_E), 6, 6))
+        np.add.at(summed, of, weights[:, None, None] * normal)
+        if scale is None:
+            break
+        towards = np.zeros((len(T_P_E), 6))
+        np.add.at(towards, of, weights[:, None] * gradient)
+        floor = (1e-9 * np.trace(summed, axis1=1, axis2=2) + 1e-9)[:, None, None] * np.eye(6)
+        T_P_E = moved(T_P_E, _held(np.linalg.solve(summed + floor, -towards[..., None])[..., 0]))
+    loss = np.zeros(len(T_P_E))
+    np.add.at(loss, of, np.log1p(np.minimum(off, 1e8)))
+    all_flipped = np.zeros((len(T_P_E), model.captures), dtype=bool)
+    all_weights = np.zeros((len(T_P_E), model.captures))
+    all_flipped[of, which], all_weights[of, which] = flipped, weights
+    return Poses(arrival, T_P_E, loss, summed, all_flipped, all_weights)
+
+
+def _sights(model: Model, T_E_T: Array, which: Indices, flipped: Mask) -> tuple[Array, Array, Array]:
+    """Squares, normal and gradient of boards on T_P_E, passive arm marginalised; infinite and zero for one that is
+    not in front of the camera.
+    """
+    sight = model.sight(T_E_T, which, flipped)
+    behind = ~np.isfinite(sight.squares)
+    normal = np.where(behind[:, None, None], 0.0, sight.normal)
+    gradient = np.where(behind[:, None], 0.0, sight.gradient)
+    nothing = np.zeros((len(which), sight.towards_passive.shape[-1]))
+    W, gw, _, step = marginalised(normal, gradient, sight.towards_passive, nothing)
+    own = np.einsum("bij,bi->bj", sight.towards_passive, gradient)
+    squares = sight.squares + np.einsum("bj,bj->b", own, step)
+    return np.where(behind, np.inf, squares), W, gw
+
+
+def _held(motion: Array) -> Array:
+    """Motions (..., 6) no longer than what keeps a far step from jumping: 0.3 m and 0.5 rad."""
+    size = np.maximum(np.linalg.norm(motion[..., :3], axis=-1) / 0.3, np.linalg.norm(motion[..., 3:], axis=-1) / 0.5)
+    return np.asarray(motion / np.maximum(size, 1.0)[..., None])
+
+
+def _distinct(model: Model, poses: Poses) -> Poses:
+    """The best few of each arrival that are not the same."""
+    kept: list[int] = []
+    for a in range(model.arrivals):
+        mine: list[int] = []
+        of = np.flatnonzero(poses.arrival == a)
+        for i in of[np.argsort(poses.loss[of], kind="stable")]:
+            worse = len(mine) > 0 and poses.loss[i] > poses.loss[mine[0]] + _WORSE
+            if worse or len(mine) == _MOST_POSES:
+                break
+            if all(_differ(poses.T_P_E[i], poses.T_P_E[j]) for j in mine):
+                mine.append(int(i))
+        kept += mine
+    return poses.only(np.array(kept, dtype=np.intp))
+
+
+def _differ(T: Array, other: Array) -> bool:
+    turned = rotation_angle(T[:3, :3], other[:3, :3]) > _SAME_TURN
+    return bool(turned or np.linalg.norm(T[:3, 3] - other[:3, 3]) > _SAME_PLACE)
+
+
+def starts(model: Model, poses: Poses, thorough: bool) -> list[Start]:
+    """The best few, best first: from all arrivals together; and from three each, if thorough or if any arrival has
+    several candidates.
+    """
+    found = np.unique(poses.arrival)
+    if len(found) < 3:
+        return []
+    T_P_A, T_H_E = _closed(model, poses, _sets(poses, found, thorough))
+    # The information of an arrival on T_P_E falls by what the active arm adds, whose effect hardly depends on T_H_E.
+    T_P_A, T_H_E, off = _fitted(model, poses, T_P_A, T_H_E)
+    best = _best_of_arrival(off, poses.arrival, model.arrivals)
+    taken = np.where(np.isfinite(best), np.log1p(np.minimum(best / 6, 1e8)), 0.0)
+    order = np.argsort(taken.sum(axis=1), kind="stable")
+    results: list[Start] = []
+    for i in order:
+        if len(results) == _MOST_STARTS:
+            break
+        if any(not _differ(T_P_A[i], r.T_P_A) and not _differ(T_H_E[i], r.T_H_E) for r in results):
+            continue
+        results.append(_start(model, poses, T_P_A[i], T_H_E[i], off[i], float(taken[i].sum())))
+    return results
+
+
+def _sets(poses: Poses, arrivals: Indices, thorough: bool) -> list[Indices]:
+    """Of candidates: the best of all arrivals; and such of three arrivals, if thorough or if arrivals have several."""
+    of = [np.flatnonzero(poses.arrival == a) for a in arrivals]
+    sets = [np.array([candidates[0] for candidates in of])]
+    if not thorough and all(len(candidates) == 1 for candidates in of):
+        return sets
+    triples = list(combinations(range(len(of)), 3))
+    most = max(_FEWEST_SETS, _MOST_PAIRS // len(poses.arrival))
+    if len(triples) > most:
+        rng = np.random.default_rng(0)
+        triples = [tuple(rng.choice(len(of), 3, replace=False)) for _ in range(most)]
+    chosen = [np.array(members) for triple in triples for members in product(*(of[i] for i in triple))]
+    if len(chosen) > 4 * most:
+        chosen = [chosen[i] for i in np.random.default_rng(0).choice(len(chosen), 4 * most, replace=False)]
+    return sets + chosen
+
+
+def _closed(model: Model, poses: Poses, sets: list[Indices]) -> tuple[Array, Array]:
+    T_P_A, T_H_E = [], []
+    for members in (sets[:1], sets[1:]):
+        if not members:
+            continue
+        chosen = np.stack(members)
+        X, Y = solve(model.T_A_H[poses.arrival[chosen]], inverse(poses.T_P_E[chosen]))
+        T_P_A.append(inverse(Y))
+        T_H_E.append(X)
+    return np.concatenate(T_P_A), np.concatenate(T_H_E)
+
+
+def _fitted(model: Model, poses: Poses, T_P_A: Array, T_H_E: Array) -> tuple[Array, Array, Array]:
+    """Cells (s, 4, 4) refined on the poses of the arrivals, and the squared distances (s, c) of these in sigmas."""
+    T_A_H, J = model.T_A_H[poses.arrival], model.noise.active * model.J_active[poses.arrival]
+    none = np.zeros((len(poses.arrival), J.shape[-1]))
+    for scale in (*_CELL_SCALES, None):
+        T_E_H = inverse(T_H_E)
+        d = motion_between(poses.T_P_E[None], T_P_A[:, None] @ T_A_H[None] @ T_H_E[:, None])
+        A = adjoint(T_E_H)[:, None] @ J[None]
+        shape = (-1, *A.shape[2:])
+        flat_normal = np.broadcast_to(poses.normal, (len(T_P_A), *poses.normal.shape)).reshape(-1, 6, 6)
+        information = marginalised(
+            flat_normal, np.zeros((len(flat_normal), 6)), A.reshape(shape), np.tile(none, (len(T_P_A), 1))
+        )[0]
+        information = information.reshape(len(T_P_A), -1, 6, 6)
+        towards = (information @ d[..., None])[..., 0]
+        off = np.einsum("sci,sci->sc", d, towards)
+        if scale is None:
+            return T_P_A, T_H_E, off
+        best = _best_of_arrival(off, poses.arrival, model.arrivals)[:, poses.arrival]
+        weights = np.where(off <= best, 1 / (1 + off / 6 / scale**2), 0.0)
+        G = np.empty((*off.shape, 6, 12))
+        G[..., :6] = adjoint(inverse(T_A_H[None] @ T_H_E[:, None]))
+        G[..., 6:] = np.eye(6)
+        G_T = np.swapaxes(G, -1, -2) * weights[..., None, None]
+        normal = np.sum(G_T @ information @ G, axis=1)
+        gradient = np.sum((G_T @ towards[..., None])[..., 0], axis=1)
+        damping = (1e-9 * np.trace(normal, axis1=1, axis2=2) + 1e-9)[:, None, None] * np.eye(12)
+        step = np.linalg.solve(normal + damping, -gradient[..., None])[..., 0]
+        T_P_A, T_H_E = moved(T_P_A, _held(step[:, :6])), moved(T_H_E, _held(step[:, 6:]))
+    raise AssertionError
+
+
+def _best_of_arrival(off: Array, arrival: Indices, arrivals: int) -> Array:
+    """(s, a): the least of (s, c) over the candidates of each arrival; infinite for one without any."""
+    best = np.full((len(off), arrivals), np.inf)
+    np.minimum.at(best.T, arrival, off.T)
+    return best
+
+
+def _start(model: Model, poses: Poses, T_P_A: Array, T_H_E: Array, off: Array, loss: float) -> Start:
+    flipped = np.zeros(model.captures, dtype=bool)
+    fits = np.zeros(model.captures, dtype=bool)
+    for a in np.unique(poses.arrival):
+        of = np.flatnonzero(poses.arrival == a)
+        best = of[np.argmin(off[of])]
+        flipped |= poses.flipped[best]
+        if off[best] / 6 < _CELL_SCALES[-1] ** 2:
+            fits |= poses.weights[best] > 0.5
+    return Start(T_P_A, T_H_E, flipped, loss, fits)

@@ -1,0 +1,97 @@
+"""Captures that do not belong: which are dropped, which are not, and what is said of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from procedures.estimation.refined.estimate import refined
+from procedures.estimation.refined.fit import minimise
+from procedures.estimation.refined.model import Model
+from procedures.estimation.refined.outliers import distances, predicted_distances
+from tools.benchmarks.refined import NOISES, contaminated, misread, reference, sort_out
+
+NOISE = NOISES[0]
+
+
+class TestDistances:
+    def test_of_good_captures_they_are_chi_squares(self) -> None:
+        """Over 50 draws of 28 captures and of 7 arrivals."""
+        cell = reference()
+        rng = np.random.default_rng(0)
+        captures, arrivals = [], []
+        for _ in range(50):
+            model = Model(cell.noisy(rng, NOISE), cell.knowns, NOISE)
+            found = distances(model, minimise(model, model.state(cell.T_P_A, cell.T_H_E)))
+            captures.append(found.captures)
+            arrivals.append(found.arrivals)
+        assert np.mean(captures) == pytest.approx(18, rel=0.05)
+        assert np.var(captures) == pytest.approx(36, rel=0.15)
+        assert np.mean(arrivals) == pytest.approx(6, rel=0.15)
+
+    @pytest.mark.parametrize("whole_arrival", [False, True])
+    def test_leaving_out_in_the_linear_model_is_leaving_out(self, whole_arrival: bool) -> None:
+        cell = reference()
+        data = cell.noisy(np.random.default_rng(0), NOISE)
+        out = data.arrivals == 1 if whole_arrival else np.arange(len(data)) == 5
+        every, model = Model(data, cell.knowns, NOISE), Model(data.only(~out), cell.knowns, NOISE)
+        fit = minimise(model, model.state(cell.T_P_A, cell.T_H_E))
+        predicted = predicted_distances(every=every, model=model, fit=fit, flipped=np.zeros(len(data), bool))
+        if whole_arrival:
+            assert 5 < predicted[out].mean() < 40
+        else:
+            full = minimise(every, every.state(cell.T_P_A, cell.T_H_E))
+            assert distances(every, full).captures[out] == pytest.approx(predicted[out], abs=0.01)
+
+
+class TestSets:
+    def test_those_that_are_wrong_are_dropped_and_no_others(self) -> None:
+        cell = reference()
+        rng = np.random.default_rng(1)
+        for spoil in [contaminated] * 4 + [misread] * 2:
+            found = sort_out(cell, *spoil(rng, cell.noisy(rng, NOISE)), NOISE)
+            assert found.named
+            assert found.error[0] <= 1.2 * found.without[0]
+            assert found.error[1] <= 1.2 * found.without[1]
+
+    def test_of_clean_sets_none_is_dropped(self) -> None:
+        cell = reference()
+        rng = np.random.default_rng(2)
+        assert all(refined(cell.noisy(rng, NOISE), cell.knowns, NOISE).used.all() for _ in range(25))
+
+    def test_noise_larger_than_stated_is_no_reason_to_drop_but_widens_the_covariance(self) -> None:
+        cell = reference()
+        loud = replace(NOISE, pixel=4 * NOISE.pixel)
+        found = refined(cell.noisy(np.random.default_rng(0), loud), cell.knowns, NOISE)
+        assert found.used.all()
+        assert 2 < np.sqrt(found.scale) < 5
+        assert any("times what the stated noise explains" in words for words in found.warnings)
+        error = cell.error(found.T_P_A, found.T_H_E)
+        assert error @ np.linalg.solve(found.covariance, error) < 40
+
+    def test_keep_all_keeps_all(self) -> None:
+        cell = reference()
+        data = cell.noisy(np.random.default_rng(0), NOISE)
+        data.pixels[7] += 6
+        assert refined(data, cell.knowns, NOISE, keep_all=True).used.all()
+        assert not refined(data, cell.knowns, NOISE).used[7]
+
+
+class TestReasons:
+    def test_each_dropped_capture_is_named_with_its_reason(self) -> None:
+        cell = reference()
+        data = cell.noisy(np.random.default_rng(0), NOISE)
+        data.pixels[2] = data.pixels[2, ::-1]
+        data.pixels[9, :, 0] += 20
+        data.active[data.arrivals == 5, 1] += np.radians(2)
+        data.pixels[27] = np.nan
+        found = refined(data, cell.knowns, NOISE)
+        reasons = {dropped.capture: dropped.reason for dropped in found.dropped}
+        wrong = [2, 9, *np.flatnonzero(data.arrivals == 5).tolist(), 27]
+        assert sorted(reasons) == wrong
+        assert "from the other end" in reasons[2]
+        assert "sigma (rms)" in reasons[9]
+        assert "active arm stood elsewhere" in reasons[20]
+        assert "no corner was seen" in reasons[27]

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
 
+from backends.controller.can.configuration import HEARTBEAT_LOST
+from backends.controller.tcp.dialects import STOP_BEHIND
 from dualcal_hal.errors import CommandRefused, DeviceError
-from tests.guarded_cell import ARMS, BUS, MOTION, Guarded, guarded, wired_cell
+from tests.guarded_cell import ARMS, BUS, MOTION, UNHURRIED_MS, Guarded, guarded, wired_cell
+from tests.running import gone_on_with, kill, running
 from tests.simple_message_client import PATIENCE
+from tools.benchmarks.faults import cases, tried
+from tools.cli.exits import INTERRUPTED
 
 AWAY = (0.8, 0.1)
 PING = 1
 ENABLE = 0x0F
+POINTS_LAST = STOP_BEHIND
+BRAKING = 0.6
+"""Seconds in which an arm comes to rest, on a machine that does more than that."""
 HOME = tuple(map(float, wired_cell("rep").cell.active.home))
 
 
@@ -81,6 +92,69 @@ def test_nor_does_one_that_is_restarted_between_moves(link: str) -> None:
         with pytest.raises(CommandRefused, match=r"left: move: it stands .* from where its last motion has ended"):
             cell.start("left", 0.2)
         cell.stays(cell.served.places())
+
+
+# Whole runs
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("link", ["rep", "can"])
+def test_the_first_ctrl_c_within_a_move_stops_both_arms_and_ends_cleanly(link: str, tmp_path: Path) -> None:
+    with running(tmp_path, link) as run:
+        begun = run.moves()
+        os.kill(run.process.pid, signal.SIGINT)
+        assert run.ends() == INTERRUPTED
+        assert "interrupted by SIGINT" in run.said
+        assert "stopped: left, right" in run.said
+        assert sorted(run.stops) == ["left", "right"]
+        assert max(run.rests.values()) < begun + 2.0
+        assert "the session is kept" in run.said
+        assert run.session.is_dir()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("link", "overrides", "speed", "within"),
+    [
+        ("can", (), 1.0, HEARTBEAT_LOST),  # drives that get no more targets stand at the last one
+        ("can", ("backends.cell.link.can.mode=profile",), 0.05, HEARTBEAT_LOST),  # and others go on until they miss it
+        ("rep", (), 0.05, 0.0),
+        ("fanuc", (), 1.0, POINTS_LAST),
+    ],
+)
+def test_arms_stop_by_themselves_when_this_program_is_killed(
+    link: str, overrides: tuple[str, ...], speed: float, within: float, tmp_path: Path
+) -> None:
+    with running(tmp_path, link, *overrides, speed=speed) as run:
+        run.moves()
+        killed = kill(run.process.pid)
+        assert run.ends() == -signal.SIGKILL
+        assert run.stops == []
+        assert max(run.rests.values()) < killed + within + BRAKING
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("link", ["abb", "can"])
+def test_a_run_whose_controller_dies_within_a_move_ends_with_its_name_and_can_be_gone_on_with(
+    link: str, tmp_path: Path
+) -> None:
+    with running(tmp_path, link) as run:
+        run.moves()
+        kill(run.emulator)
+        assert run.ends() == 1
+        assert re.search("dualcal: (left|right): .*the controller closed|the bus .* failed", run.said)
+        assert "it may still move: use the emergency stop" in run.said
+        if link == "abb":
+            assert gone_on_with(run.session)["verdict"] == "ok"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("link", "fault"), [("fanuc", "half-open"), ("can", "missing-pdo")])
+def test_a_fault_ends_a_run_by_its_name_and_it_can_be_gone_on_with(link: str, fault: str) -> None:
+    unhurried = [f"backends.cell.link.can.sync_period_ms={UNHURRIED_MS}"] if link == "can" else []
+    case = next(case for case in cases(link) if case.fault == fault)
+    (trial,), _ = tried(link, case, unhurried, 1)
+    assert trial.wrong == []
 
 
 def is_there(cell: Guarded) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from dualcal_hal.backend import Answer
 from dualcal_hal.cell import Arm, Cell
 from dualcal_hal.errors import (
     ArmMoved,
+    DeviceError,
     DualcalError,
     FormatError,
     Interrupted,
@@ -22,7 +24,7 @@ from dualcal_hal.errors import (
     StopFailed,
 )
 from dualcal_hal.guard import READ_TIMEOUT
-from dualcal_hal.robot import Joints, Motion, RobotState
+from dualcal_hal.robot import JointPath, Joints, Motion, RobotState
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.journal import Left, Standing
 from procedures.observers import Observers
@@ -72,6 +74,8 @@ class Engine:
         self._wake = threading.Event()
         self._abort_reason: str | None = None
         self._arms = {arm.robot.name: arm for arm in (cell.active, cell.passive)}
+        self._beginning: Arm | None = None
+        """The arm that is being told to move."""
         self._moved: set[str] = set()
         """Arms that this engine has moved: they are to be stopped."""
         self._commanded: dict[str, Joints] = {}
@@ -113,6 +117,11 @@ class Engine:
         """End the run at once: from any thread, any number of times; not from a signal's handler."""
         self._abort_reason = reason
         self._wake.set()
+        beginning = self._beginning
+        if beginning is not None:
+            # A controller may take seconds to take a motion, and the run waits for that.
+            with suppress(DeviceError):  # the run stops it once more, and tells
+                beginning.robot.stop(reason)
 
     @property
     def aborted(self) -> bool:
@@ -231,8 +240,16 @@ class Engine:
         self._moved.add(arm.robot.name)
         self._commanded[arm.robot.name] = waypoints[-1]
         self._arrivals[arm.robot.name] += 1
-        state = self._wait(arm.robot.start(path), LATE_FACTOR * float(needed) + LATE_MARGIN)
-        return state
+        return self._wait(self._begin(arm, path), LATE_FACTOR * float(needed) + LATE_MARGIN)
+
+    def _begin(self, arm: Arm, path: JointPath) -> Motion:
+        # In made time nothing is waited for here, and a stop would make some.
+        self._beginning = arm if self._cell.time == "real" else None
+        try:
+            self._raise_if_aborted()
+            return arm.robot.start(path)
+        finally:
+            self._beginning = None
 
     def _wait(self, motion: Motion, timeout: float) -> RobotState:
         """The one place where the engine waits; wakes at once when the motion ends or the run is aborted."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -307,3 +308,30 @@ def test_a_task_that_fails_is_not_finished(engine):
 
     assert engine.run(procedure()) == "failed"
     assert engine._session.journal.result(key) is None
+
+
+def test_an_abort_stops_an_arm_whose_controller_is_still_taking_its_motion(engine, cell, monkeypatch):
+    stopped, asked = threading.Event(), threading.Event()
+
+    def start(path):
+        asked.set()
+        assert stopped.wait(20)
+        raise MotionStopped("left", "move", "stopped: enough")
+
+    def stop(reason):
+        stopped.set()
+        return StopResult(True)
+
+    monkeypatch.setattr(Cell, "time", "real")
+    monkeypatch.setattr(cell.active.robot, "start", start)
+    monkeypatch.setattr(cell.active.robot, "stop", stop)
+
+    def abort():
+        assert asked.wait(20)
+        engine.abort("enough")
+
+    operator = threading.Thread(target=abort)
+    operator.start()
+    with pytest.raises(MotionStopped, match="enough"):
+        engine.run(move(cell.active.robot.name, (0.1, 0.0, 1.0, 0.0, 0.5, 0.0)))
+    operator.join()

@@ -154,8 +154,10 @@ def _redirected(name: str, link: Link, endpoints: Mapping[str, Any]) -> Link:
         if kind == "can":
             document["can"]["interface"] = told["interface"]
             document["can"].pop("bitrate", None)  # the emulator's bus has none
+        addresses = ("host", "motion_port", "state_port") if kind == "tcp" else ("channel",)
         for arm in document[kind]["arms"]:
-            document[kind]["arms"][arm].update(arms[arm])
+            # All of them: none of a real controller's addresses may be left.
+            document[kind]["arms"][arm].update({address: arms[arm][address] for address in addresses})
         return Link.model_validate(document)
     except (KeyError, TypeError, ValidationError) as error:
         raise UsageError(f"{name}: the emulator does not say where to reach it by {kind}: {error!r}") from error

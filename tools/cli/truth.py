@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from dualcal_hal import registry
-from dualcal_hal.cellfile import CellFile
+from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.errors import UsageError
 from dualcal_hal.session.conduct import read_conduct
-from dualcal_hal.session.folder import Session
+from dualcal_hal.session.folder import CELL_FILE, Session
 from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME
 from dualcal_hal.transforms import Array
 
@@ -34,8 +34,21 @@ def told_truth(file: CellFile) -> Mapping[str, Array] | None:
 
 def _is_simulated(file: CellFile) -> bool:
     cell = file.cell
-    used = {cell.active.backend, cell.passive.backend, cell.camera.backend}
+    used = [cell.backends[name] for name in {cell.active.backend, cell.passive.backend, cell.camera.backend}]
     try:
-        return all(registry.backend_class(cell.backends[name].type).simulated for name in used)
+        return all(
+            _was_simulated(Path(entry.options["session"]))
+            if entry.type == "replay"
+            else registry.backend_class(entry.type).simulated
+            for entry in used
+        )
     except (UsageError, ImportError):  # one that is not installed here; none that simulates is missing
         return False
+
+
+def _was_simulated(recording: Path) -> bool:
+    """Whether a recorded run was one of a simulated cell; of one that is gone that is not known."""
+    session = recording if recording.is_dir() else recording.parent
+    if not (session / CELL_FILE).exists():
+        return False
+    return simulated_truth(load_cell(session / CELL_FILE, meshes=False, backends=False), session) is not None

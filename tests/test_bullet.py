@@ -22,7 +22,6 @@ from backends.simulator.bullet.bodies import STEP, BulletBodies
 from backends.simulator.bullet.client import pybullet
 from backends.simulator.bullet.nearness import Nearness
 from backends.simulator.bullet.stepper import SETTLED, BulletStepper
-from dualcal_hal.trajectory import Trajectory
 from backends.simulator.truth import Truth
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.errors import CellFileError, CommandRefused, Contact, MotionFailed
@@ -30,6 +29,7 @@ from dualcal_hal.geometry import CellGeometry, Placement, segment_distance
 from dualcal_hal.kinematics import Chain, Row
 from dualcal_hal.robot import JointPath, Joints, Mode, Motion, RobotState
 from dualcal_hal.session.distances import Distances
+from dualcal_hal.trajectory import Trajectory
 from dualcal_hal.transforms import Array, apply, inverse
 from tests.cells import NOISELESS, PAPER, SMALL
 from tools.cli.app import app

@@ -21,13 +21,13 @@ from hypothesis import strategies as st
 from backends.simulator import SimulatorBackend
 from backends.simulator.camera import LATENCY
 from backends.simulator.noise import generator
-from dualcal_hal.trajectory import Trajectory
 from backends.simulator.world import World
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.clock import VirtualClock
 from dualcal_hal.errors import CellFileError, CommandRefused, DeviceError, MotionStopped, NotOpen, UsageError
 from dualcal_hal.registry import backend_class
 from dualcal_hal.robot import JointPath, Joints, Motion, MotionState, RobotState
+from dualcal_hal.trajectory import Trajectory
 from dualcal_hal.transforms import Array
 from tests.reference_cell import DOCUMENT
 

@@ -1,6 +1,6 @@
 """Accuracy of the refined estimate against what is possible at all, over many draws of the noise.
 
-python -m tools.benchmarks.refined bound|cells|outliers [--runs N]
+python -m tools.benchmarks.refined bound|cells|outliers|noise [--runs N]
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from procedures.estimation.refined.estimate import refined
 from procedures.estimation.refined.fit import minimise
 from procedures.estimation.refined.model import Model
 from procedures.estimation.refined.motion import adjoint, logarithm
+from procedures.estimation.refined.noise import FoundNoise, find_noise
 
 ROOT = Path(__file__).parents[2]
 CELL = ROOT / "cells" / "paper.yaml"
@@ -374,6 +375,32 @@ def report_outliers(runs: int) -> None:
     print(f"clean, {runs} runs: none dropped {np.mean(clean):.2%}")
 
 
+def noises_found(cell: Cell, noise: Noise, stated: Noise, runs: int, seed: int) -> list[FoundNoise]:
+    """What draws of the noise say of it, where another was stated."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(runs):
+        data = cell.noisy(rng, noise)
+        model = Model(data, cell.knowns, stated)
+        state = minimise(model, model.state(cell.T_P_A, cell.T_H_E)).state
+        found.append(find_noise(data, cell.knowns, stated, state.T_P_A, state.T_H_E))
+    return found
+
+
+def report_noise(runs: int) -> None:
+    for noise in NOISES:
+        found = noises_found(reference(), noise, Noise(0.05, 3e-5, 3e-5), runs, seed=1)
+        pixel = np.mean([abs(one.pixel.value / noise.pixel - 1) <= 0.15 for one in found])
+        joint = np.mean([abs(one.joint.value / noise.passive - 1) <= 0.35 for one in found])
+        known = np.mean([one.joint.identified for one in found])
+        below = np.mean([noise.passive <= one.joint.upper for one in found])
+        print(
+            f"{noise.pixel:g} px, joints {1e3 * noise.active:g} mrad, {runs} runs: pixel within 15 % {pixel:.2%}",
+            end=", ",
+        )
+        print(f"joint within 35 % {joint:.2%}, identified {known:.2%}, below its upper end {below:.2%}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="what", required=True)
@@ -381,10 +408,12 @@ def main() -> None:
         ("bound", "errors against the bound, at the three noises", 2000),
         ("cells", "random cells without a nominal", 1000),
         ("outliers", "captures that are wrong, and none", 500),
+        ("noise", "sigmas found from the captures", 200),
     ):
         commands.add_parser(name, help=help_).add_argument("--runs", type=int, default=runs)
     arguments = parser.parse_args()
-    {"bound": report_bound, "cells": report_cells, "outliers": report_outliers}[arguments.what](arguments.runs)
+    reports = {"bound": report_bound, "cells": report_cells, "outliers": report_outliers, "noise": report_noise}
+    reports[arguments.what](arguments.runs)
 
 
 if __name__ == "__main__":

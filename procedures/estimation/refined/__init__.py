@@ -2,6 +2,7 @@
 
 from procedures.estimation.refined.data import CaptureArrays, Knowns, Noise
 from procedures.estimation.refined.estimate import Alternative, Dropped, Refined, refined
+from procedures.estimation.refined.noise import FoundNoise, Sigma
 from procedures.estimation.refined.uncertainty import Direction, Limits, SpatialError
 
 __all__ = [
@@ -9,10 +10,12 @@ __all__ = [
     "CaptureArrays",
     "Direction",
     "Dropped",
+    "FoundNoise",
     "Knowns",
     "Limits",
     "Noise",
     "Refined",
+    "Sigma",
     "SpatialError",
     "refined",
 ]

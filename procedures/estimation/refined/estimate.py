@@ -16,6 +16,7 @@ from procedures.estimation.refined.fit import Fit, minimise
 from procedures.estimation.refined.geometry import refuse_few, refuse_one_axis
 from procedures.estimation.refined.model import CELL, Model
 from procedures.estimation.refined.motion import motion_between
+from procedures.estimation.refined.noise import FoundNoise, find_noise
 from procedures.estimation.refined.outliers import (
     Distances,
     between_arrivals,
@@ -41,6 +42,7 @@ _APART = 5e-3  # rad
 
 _SUSPICIOUS = 4.0  # squares this many times larger than the noise says: perhaps not the right optimum
 _MOST_ROUNDS = 12
+_NOISE_ROUNDS = 2  # what is found for the noise moves the estimate, which hardly moves what is found
 _SIGNIFICANT = 1e-3
 _LARGE = 0.005  # m; a predicted sigma above it is warned of
 
@@ -94,6 +96,8 @@ class Refined:
     dropped: tuple[Dropped, ...]
     alternatives: tuple[Alternative, ...]
     warnings: tuple[str, ...]
+    noise: Noise
+    found: FoundNoise | None = None
 
     def spatial_error(self, points: ArrayLike) -> SpatialError:
         """Predicted at points (..., 3) of the passive base, m."""
@@ -107,14 +111,35 @@ def refined(
     *,
     further_starts: Sequence[tuple[ArrayLike, ArrayLike]] = (),
     keep_all: bool = False,
+    estimate_noise: bool = False,
     observable: Limits | None = None,
 ) -> Refined:
     """Estimate T_P_A and T_H_E from captures alone.
 
     further_starts: pairs of T_P_A and T_H_E, such as the nominal ones, tried besides those found from the captures.
-    keep_all: no capture is dropped however badly it fits. Raises Degenerate for captures that do not determine both
-    transforms.
+    keep_all: no capture is dropped however badly it fits. estimate_noise: the sigmas are found from the captures; of
+    ``noise`` only the ratio of both arms counts then, and where to begin. Raises Degenerate for captures that do not
+    determine both transforms.
     """
+    fixed = (further_starts, keep_all, observable or Limits())
+    result = _estimate(data, knowns, noise, *fixed)
+    if not estimate_noise:
+        return result
+    for _ in range(_NOISE_ROUNDS):
+        kept = data.turned(result.flipped).only(result.used)
+        found = find_noise(kept, knowns, noise, result.T_P_A, result.T_H_E)
+        result = _estimate(data, knowns, found.noise, *fixed)
+    return replace(result, found=found, warnings=(*result.warnings, *_noise_warnings(found)))
+
+
+def _estimate(
+    data: CaptureArrays,
+    knowns: Knowns,
+    noise: Noise,
+    further_starts: Sequence[tuple[ArrayLike, ArrayLike]],
+    keep_all: bool,
+    observable: Limits,
+) -> Refined:
     data = replace(data, arrivals=_by_reading(data))
     every = Model(data, knowns, noise)
     usable = every.seen.sum(axis=1) > 0
@@ -140,7 +165,7 @@ def refined(
     best = solutions[0]
     axes = best.model.arrival_poses(best.fit.state)[0][:, :3, 2]
     warnings = refuse_one_axis(best.model.T_A_H, axes, noise.active)
-    return _result(search, best, _alternatives(best, solutions[1:]), warnings, observable or Limits())
+    return _result(search, best, _alternatives(best, solutions[1:]), warnings, observable)
 
 
 @dataclass(frozen=True)
@@ -323,6 +348,7 @@ def _result(
         dropped=_dropped(search, best),
         alternatives=alternatives,
         warnings=(*warnings, *_warnings(fit, found, scale, alternatives)),
+        noise=search.every.noise,
     )
 
 
@@ -350,6 +376,18 @@ def _warnings(fit: Fit, found: Sequence[Direction], scale: float, alternatives: 
         )
     words += [f"a second solution costs only {alternative.ratio:.2f} times as much" for alternative in alternatives]
     return words
+
+
+def _noise_warnings(found: FoundNoise) -> list[str]:
+    unknown = [
+        f"{name} of at most {scale * sigma.upper:.3g} {unit} cannot be told from none"
+        for name, sigma, scale, unit in (
+            ("a pixel sigma", found.pixel, 1, "px"),
+            ("a joint sigma", found.joint, 1e3, "mrad"),
+        )
+        if not sigma.identified
+    ]
+    return [f"{words}; it was reckoned with" for words in unknown]
 
 
 def _dropped(search: _Search, best: _Solution) -> tuple[Dropped, ...]:

@@ -1,0 +1,57 @@
+"""Sigmas found from the captures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from procedures.estimation.refined import Noise, refined
+from tools.benchmarks.refined import NOISES, noises_found, reference
+
+STATED = Noise(0.05, 3e-5, 3e-5)
+
+
+@pytest.mark.parametrize("noise", NOISES[:2])
+def test_pixel_and_joint_sigma_are_found_whatever_was_stated(noise: Noise) -> None:
+    found = noises_found(reference(), noise, STATED, runs=4, seed=1)
+    for one in found:
+        assert one.pixel.value == pytest.approx(noise.pixel, rel=0.15)
+        assert one.joint.value == pytest.approx(noise.passive, rel=0.45)
+        assert one.joint.identified
+    assert np.median([one.joint.value for one in found]) == pytest.approx(noise.passive, rel=0.2)
+
+
+def test_a_joint_sigma_too_small_to_be_seen_has_an_upper_bound() -> None:
+    noise = NOISES[2]
+    for one in noises_found(reference(), noise, STATED, runs=2, seed=2):
+        assert one.pixel.value == pytest.approx(noise.pixel, rel=0.15)
+        assert noise.passive < one.joint.upper < 5e-5
+        assert not one.joint.identified
+        assert one.noise.passive == one.joint.upper
+
+
+def test_the_ratio_of_both_arms_stays_what_was_stated() -> None:
+    noise = Noise(0.1, 2e-4, 1e-4)
+    (found,) = noises_found(reference(), noise, Noise(0.05, 2e-5, 1e-5), runs=1, seed=3)
+    assert found.noise.active == pytest.approx(2 * found.noise.passive)
+    assert found.joint.value == pytest.approx(1e-4, rel=0.45)
+
+
+def test_the_estimate_is_that_of_the_noise_that_was_found() -> None:
+    cell, noise = reference(), NOISES[0]
+    data = cell.noisy(np.random.default_rng(0), noise)
+    wrong = Noise(1.0, 1e-5, 1e-5)
+    found, right = refined(data, cell.knowns, wrong, estimate_noise=True), refined(data, cell.knowns, noise)
+    assert found.found is not None
+    assert found.noise == found.found.noise
+    np.testing.assert_allclose(found.T_P_A, right.T_P_A, atol=5e-5)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), np.sqrt(np.diag(right.covariance)), rtol=0.35)
+
+
+def test_outliers_are_not_taken_for_noise() -> None:
+    cell, noise = reference(), NOISES[0]
+    data = cell.noisy(np.random.default_rng(0), noise)
+    data.pixels[4] += 8
+    found = refined(data, cell.knowns, STATED, estimate_noise=True)
+    assert np.flatnonzero(~found.used).tolist() == [4]
+    assert found.noise.pixel == pytest.approx(noise.pixel, rel=0.15)

@@ -13,7 +13,7 @@ STATED = Noise(0.05, 3e-5, 3e-5)
 
 @pytest.mark.parametrize("noise", NOISES[:2])
 def test_pixel_and_joint_sigma_are_found_whatever_was_stated(noise: Noise) -> None:
-    found = noises_found(reference(), noise, STATED, runs=4, seed=1)
+    found = noises_found(reference(), noise, STATED, runs=3, seed=1)
     for one in found:
         assert one.pixel.value == pytest.approx(noise.pixel, rel=0.15)
         assert one.joint.value == pytest.approx(noise.passive, rel=0.45)

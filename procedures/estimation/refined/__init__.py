@@ -2,6 +2,15 @@
 
 from procedures.estimation.refined.data import CaptureArrays, Knowns, Noise
 from procedures.estimation.refined.estimate import Alternative, Dropped, Refined, refined
+from procedures.estimation.refined.inexact import (
+    Inexact,
+    Known,
+    intrinsics,
+    joint_zeros,
+    link_parameters,
+    square_size,
+    target_mount,
+)
 from procedures.estimation.refined.noise import FoundNoise, Sigma
 from procedures.estimation.refined.uncertainty import Direction, Limits, SpatialError
 
@@ -11,11 +20,18 @@ __all__ = [
     "Direction",
     "Dropped",
     "FoundNoise",
+    "Inexact",
+    "Known",
     "Knowns",
     "Limits",
     "Noise",
     "Refined",
     "Sigma",
     "SpatialError",
+    "intrinsics",
+    "joint_zeros",
+    "link_parameters",
     "refined",
+    "square_size",
+    "target_mount",
 ]

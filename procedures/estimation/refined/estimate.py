@@ -12,8 +12,9 @@ from scipy import stats
 from dualcal_hal.transforms import Array, Mask
 from procedures.estimation.degenerate import Degenerate
 from procedures.estimation.refined.data import CaptureArrays, Indices, Knowns, Noise
-from procedures.estimation.refined.fit import Fit, minimise
+from procedures.estimation.refined.fit import Fit, minimise, noise_contributions
 from procedures.estimation.refined.geometry import refuse_few, refuse_one_axis
+from procedures.estimation.refined.inexact import Inexact, Known, WithInexact, fit_inexact
 from procedures.estimation.refined.model import CELL, Model
 from procedures.estimation.refined.motion import motion_between
 from procedures.estimation.refined.noise import FoundNoise, find_noise
@@ -76,6 +77,10 @@ class Refined:
     residuals (k, n, 2): pixels in units of sigma, NaN for corners not seen and captures not used; distances (k,):
     squared Mahalanobis distance of each capture from where the others put it, NaN for those not used; freedoms (k,):
     its degrees of freedom. flipped (k,): captures taken with their corners from the other end. used (k,).
+
+    noise, knowns: what was reckoned with; found: what the captures themselves say of the noise, if that was asked for;
+    known: inexact knowns after the estimate. contributions: to the covariance (12, 12), of pixels, of the joints of
+    both arms and of each inexact known.
     """
 
     T_P_A: Array
@@ -97,7 +102,10 @@ class Refined:
     alternatives: tuple[Alternative, ...]
     warnings: tuple[str, ...]
     noise: Noise
+    knowns: Knowns
+    contributions: dict[str, Array]
     found: FoundNoise | None = None
+    known: tuple[Known, ...] = ()
 
     def spatial_error(self, points: ArrayLike) -> SpatialError:
         """Predicted at points (..., 3) of the passive base, m."""
@@ -112,6 +120,8 @@ def refined(
     further_starts: Sequence[tuple[ArrayLike, ArrayLike]] = (),
     keep_all: bool = False,
     estimate_noise: bool = False,
+    inexact: Sequence[Inexact] = (),
+    estimate_inexact: bool = True,
     observable: Limits | None = None,
 ) -> Refined:
     """Estimate T_P_A and T_H_E from captures alone.
@@ -119,17 +129,54 @@ def refined(
     further_starts: pairs of T_P_A and T_H_E, such as the nominal ones, tried besides those found from the captures.
     keep_all: no capture is dropped however badly it fits. estimate_noise: the sigmas are found from the captures; of
     ``noise`` only the ratio of both arms counts then, and where to begin. Raises Degenerate for captures that do not
-    determine both transforms.
+    determine both transforms. inexact: knowns with a sigma, estimated with it as their prior, or else only reckoned
+    with in the covariance; Degenerate too for one that is free and cannot be seen.
     """
     fixed = (further_starts, keep_all, observable or Limits())
-    result = _estimate(data, knowns, noise, *fixed)
-    if not estimate_noise:
+    there = knowns
+    if inexact and estimate_inexact:
+        # What does not belong is told only once the knowns are about right.
+        there = _with_inexact(data, knowns, noise, _estimate(data, knowns, noise, *fixed), inexact, True).knowns
+    result, found = _estimate(data, there, noise, *fixed), None
+    for _ in range(_NOISE_ROUNDS if estimate_noise else 0):
+        found = find_noise(_kept(data, result), there, noise, result.T_P_A, result.T_H_E)
+        result = _estimate(data, there, found.noise, *fixed)
+    if found is not None:
+        result = replace(result, found=found, warnings=(*result.warnings, *_noise_warnings(found)))
+    if not inexact:
         return result
-    for _ in range(_NOISE_ROUNDS):
-        kept = data.turned(result.flipped).only(result.used)
-        found = find_noise(kept, knowns, noise, result.T_P_A, result.T_H_E)
-        result = _estimate(data, knowns, found.noise, *fixed)
-    return replace(result, found=found, warnings=(*result.warnings, *_noise_warnings(found)))
+    return _combined(result, _with_inexact(data, knowns, result.noise, result, inexact, estimate_inexact), fixed[2])
+
+
+def _kept(data: CaptureArrays, result: Refined) -> CaptureArrays:
+    return replace(data, arrivals=_by_reading(data)).turned(result.flipped).only(result.used)
+
+
+def _with_inexact(
+    data: CaptureArrays, knowns: Knowns, noise: Noise, result: Refined, inexact: Sequence[Inexact], estimated: bool
+) -> WithInexact:
+    kept = _kept(data, result)
+    start = Model(kept, knowns, noise).state(result.T_P_A, result.T_H_E)
+    return fit_inexact(kept, knowns, noise, start, inexact, estimated)
+
+
+def _combined(result: Refined, found: WithInexact, observable: Limits) -> Refined:
+    """With the inexact knowns in estimate and covariance; what was widened for the residuals stays so."""
+    of_noise = sum(result.contributions.values(), np.zeros((CELL, CELL)))
+    covariance = found.covariance + of_noise * (1 - 1 / result.scale)
+    hidden = [known.name for known in found.known if not known.seen]
+    words = [f"cannot be seen in the captures: {', '.join(hidden)}"] if hidden else []
+    return replace(
+        result,
+        T_P_A=found.fit.state.T_P_A,
+        T_H_E=found.fit.state.T_H_E,
+        covariance=covariance,
+        directions=directions(covariance, observable),
+        known=found.known,
+        knowns=found.knowns,
+        contributions={**result.contributions, **found.contributions},
+        warnings=(*result.warnings, *words),
+    )
 
 
 def _estimate(
@@ -349,6 +396,8 @@ def _result(
         alternatives=alternatives,
         warnings=(*warnings, *_warnings(fit, found, scale, alternatives)),
         noise=search.every.noise,
+        knowns=search.every.knowns,
+        contributions={what: scale * part for what, part in noise_contributions(fit, model.arrival).items()},
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualcal_hal.transforms import Array
+from procedures.estimation.refined.data import Indices
 from procedures.estimation.refined.model import Linearised, Model, State
 
 MOST_STEPS = 60
@@ -51,6 +52,26 @@ def minimise(model: Model, state: State, damping: float = 1e-4, most_steps: int 
             if not damping < _MOST_DAMPING:
                 return Fit(state, at, False, step)
     return Fit(state, at, False, most_steps)
+
+
+def noise_contributions(fit: Fit, arrival: Indices) -> dict[str, Array]:
+    """What pixels and the joints of each arm contribute to the covariance (12, 12) of the cell; they add up to it.
+
+    arrival (k,): of each capture.
+    """
+    at = fit.at
+    spread = np.linalg.inv(at.normal)
+    follow_active = np.eye(6) - np.swapaxes(at.towards_active @ at.active_gain, 1, 2)
+    of_arrival = spread @ np.swapaxes(at.towards_cell, 1, 2) @ follow_active
+    follow_passive = np.eye(6) - np.swapaxes(at.towards_passive @ at.passive_gain, 1, 2)
+    of_capture = of_arrival[arrival] @ follow_passive
+    roots = {
+        "active joints": of_arrival @ at.arrival_normal @ at.towards_active,
+        "passive joints": of_capture @ at.pixel_normal @ at.towards_passive,
+    }
+    parts = {what: np.einsum("bin,bjn->ij", root, root) for what, root in roots.items()}
+    pixels = np.einsum("kia,kab,kjb->ij", of_capture, at.pixel_normal, of_capture)
+    return {"pixels": np.asarray(pixels), **parts}
 
 
 def _solved(normal: Array, right: Array) -> Array:

@@ -68,10 +68,12 @@ class Linearised:
 @dataclass(frozen=True)
 class Sight:
     """What corners say of T_P_E, passive arm as it is: squares (b,), their sum in units of sigma; normal (b, 6, 6),
-    gradient (b, 6); towards_passive (b, 6, np): how T_P_E would have to move for a sigma of the passive arm.
+    gradient (b, 6); towards_passive (b, 6, np): how T_P_E would have to move for a sigma of the passive arm. jacobian
+    (b, 2n, 6): of the residuals, in units of sigma.
     """
 
     squares: Array
+    jacobian: Array
     normal: Array
     gradient: Array
     towards_passive: Array
@@ -184,10 +186,15 @@ class Model:
         T_E_F = T_E_T @ inverse(self.knowns.T_F_T)
         return Sight(
             squares=np.sum(r**2, axis=1),
+            jacobian=J,
             normal=J_T @ J,
             gradient=(J_T @ r[..., None])[..., 0],
             towards_passive=-self.noise.passive * adjoint(T_E_F) @ J_passive,
         )
+
+    def jacobian(self, state: State) -> Array:
+        """(k, 2n, 6): of the residuals in units of sigma, by motions of T_P_E."""
+        return self.sight(self._target_in_camera(state)[1]).jacobian
 
     def arrival_poses(self, state: State) -> tuple[Array, Array, Array]:
         """T_P_E of the arrivals (a, 4, 4), and how the cell (a, 6, 12) and a sigma of the active arm (a, 6, na) move

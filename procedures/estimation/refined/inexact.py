@@ -1,0 +1,269 @@
+"""Knowns that are not exact: estimated with what is known of them as a prior, or only reckoned with.
+
+Each is a few numbers by which the knowns are off, zero where they are exact, with a sigma each; an infinite sigma frees
+one. The cell and the arms are fitted for given knowns; the knowns follow by Gauss-Newton steps on what that leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from dualcal_hal.kinematics import Chain, Row
+from dualcal_hal.transforms import Array
+from procedures.estimation.degenerate import Degenerate
+from procedures.estimation.refined.data import CaptureArrays, Knowns, Noise
+from procedures.estimation.refined.fit import Fit, minimise
+from procedures.estimation.refined.model import CELL, Model, State
+from procedures.estimation.refined.motion import moved
+
+UNSEEN = 0.98
+"""Of its prior sigma: what the captures do not make smaller than this, they do not see."""
+
+_STEP = 1e-5  # m, rad, or a part of one: of the differences
+_MOST_ROUNDS = 10
+_CONVERGED = 1e-3  # of a posterior sigma
+_SINGULAR = 1e-8  # of the scaled information, a square
+
+
+@dataclass(frozen=True)
+class Inexact:
+    """names and sigmas (m,) of the numbers by which ``shifted`` says knowns are off; scale (m,): of what counts as a
+    small change of each.
+    """
+
+    what: str
+    names: tuple[str, ...]
+    sigmas: Array
+    scale: Array
+    shifted: Callable[[Knowns, Array], Knowns]
+
+
+def target_mount(translation: float, rotation: float) -> Inexact:
+    """T_F_T, moved in T: sigmas in m and rad."""
+
+    def shifted(knowns: Knowns, by: Array) -> Knowns:
+        return replace(knowns, T_F_T=moved(knowns.T_F_T, by))
+
+    names = tuple(f"target mount, {what} {axis}" for what in ("along", "about") for axis in "xyz")
+    return Inexact("target mount", names, np.repeat([translation, rotation], 3), np.ones(6), shifted)
+
+
+def square_size(relative: float) -> Inexact:
+    """All squares by one part."""
+
+    def shifted(knowns: Knowns, by: Array) -> Knowns:
+        return replace(knowns, corners=knowns.corners * (1 + by[0]))
+
+    return Inexact("square size", ("square size",), np.array([relative]), np.ones(1), shifted)
+
+
+def intrinsics(focal: float, centre: float, distortion: Sequence[float]) -> Inexact:
+    """Sigmas of both focal lengths and of the principal point, px, and of the five coefficients."""
+
+    def shifted(knowns: Knowns, by: Array) -> Knowns:
+        matrix = knowns.matrix.copy()
+        matrix[[0, 1, 0, 1], [0, 1, 2, 2]] += by[:4]
+        return replace(knowns, matrix=matrix, distortion=knowns.distortion + by[4:])
+
+    sigmas = np.array([focal, focal, centre, centre, *distortion], dtype=float)
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    return _without_exact("intrinsics", names, sigmas, np.array([1e3] * 4 + [1.0] * 5), shifted)
+
+
+def joint_zeros(arm: str, sigmas: Sequence[float]) -> Inexact:
+    """Of the ``active`` or ``passive`` arm, one sigma a joint, rad."""
+
+    def shifted(knowns: Knowns, by: Array) -> Knowns:
+        rows = getattr(knowns, arm).rows
+        turned = tuple(replace(row, theta=row.theta + float(angle)) for row, angle in zip(rows, by, strict=True))
+        return _with_arm(knowns, arm, turned)
+
+    names = tuple(f"zero of joint {i + 1} of the {arm} arm" for i in range(len(sigmas)))
+    values = np.asarray(sigmas, dtype=float)
+    return _without_exact(f"joint zeros of the {arm} arm", names, values, np.ones(len(values)), shifted)
+
+
+def link_parameters(arm: str, joints: int, length: float, angle: float) -> Inexact:
+    """d, a and alpha of each row of the ``active`` or ``passive`` arm: sigmas in m and rad."""
+
+    def shifted(knowns: Knowns, by: Array) -> Knowns:
+        def moved_row(row: Row, d: float, a: float, alpha: float) -> Row:
+            return replace(row, d=row.d + d, a=row.a + a, alpha=row.alpha + alpha)
+
+        rows = getattr(knowns, arm).rows
+        return _with_arm(knowns, arm, tuple(moved_row(row, *b) for row, b in zip(rows, by.reshape(-1, 3), strict=True)))
+
+    names = tuple(f"{what} of row {i + 1} of the {arm} arm" for i in range(joints) for what in ("d", "a", "alpha"))
+    sigmas = np.tile([length, length, angle], joints)
+    return _without_exact(f"links of the {arm} arm", names, sigmas, np.ones(3 * joints), shifted)
+
+
+def _with_arm(knowns: Knowns, arm: str, rows: tuple[Row, ...]) -> Knowns:
+    return replace(knowns, active=Chain(rows)) if arm == "active" else replace(knowns, passive=Chain(rows))
+
+
+def _without_exact(
+    what: str, names: tuple[str, ...], sigmas: Array, scale: Array, shifted: Callable[[Knowns, Array], Knowns]
+) -> Inexact:
+    """Numbers with a sigma of zero stay where they are."""
+    moving = sigmas > 0
+
+    def of_all(knowns: Knowns, by: Array) -> Knowns:
+        every = np.zeros(len(sigmas))
+        every[moving] = by
+        return shifted(knowns, every)
+
+    kept = tuple(name for name, moves in zip(names, moving, strict=True) if moves)
+    return Inexact(what, kept, sigmas[moving], scale[moving], of_all)
+
+
+@dataclass(frozen=True)
+class Known:
+    """One number after the estimate: by how much the knowns were off (m, rad, px or a part), its sigma before and
+    after, and whether the captures see it at all.
+    """
+
+    name: str
+    value: float
+    prior: float
+    sigma: float
+    seen: bool
+
+
+@dataclass(frozen=True)
+class WithInexact:
+    """The fit with the knowns where they fit best, or as given where they are only reckoned with; covariance (12, 12)
+    of the cell with theirs; contributions: of each of them to it (12, 12), by what it is.
+    """
+
+    fit: Fit
+    model: Model
+    knowns: Knowns
+    covariance: Array
+    known: tuple[Known, ...]
+    contributions: dict[str, Array]
+
+
+def fit_inexact(
+    data: CaptureArrays, knowns: Knowns, noise: Noise, start: State, inexact: Sequence[Inexact], estimated: bool
+) -> WithInexact:
+    """From a fit to captures that belong, with their corners in order. estimated: False leaves the knowns as they are
+    and adds what they may be off by to the covariance. Raises Degenerate for a freed number that cannot be seen.
+    """
+    sigmas = np.concatenate([one.sigmas for one in inexact])
+    if not estimated and not np.all(np.isfinite(sigmas)):
+        raise ValueError("what is free has to be estimated")
+    precision = np.where(np.isfinite(sigmas), 1 / sigmas**2, 0.0)
+    theta = np.zeros(len(sigmas))
+    model = Model(data, knowns, noise)
+    fit = minimise(model, start)
+    for _ in range(_MOST_ROUNDS):
+        cross, own, gradient = _information(data, knowns, noise, inexact, theta, model, fit)
+        left = own - cross.T @ np.linalg.solve(fit.at.normal, cross) + np.diag(precision)
+        covariance = _inverted(left, np.sqrt(np.diag(own) + precision), inexact)
+        if not estimated:
+            break
+        step = -covariance @ (gradient + precision * theta)
+        theta = theta + step
+        model = Model(data, _shifted(knowns, inexact, theta), noise)
+        fit = minimise(model, fit.state)
+        if np.all(np.abs(step) < _CONVERGED * np.sqrt(np.diag(covariance))):
+            break
+    follow = np.linalg.solve(fit.at.normal, cross)  # by how much the cell follows a change of the knowns, reversed
+    spread = covariance if estimated else np.diag(sigmas**2)
+    total = np.linalg.inv(fit.at.normal) + follow @ spread @ follow.T
+    # A prior's part in the estimate: how its own error comes through.
+    through = follow @ covariance @ np.diag(precision) if estimated else follow
+    return WithInexact(
+        fit=fit,
+        model=model,
+        knowns=model.knowns,
+        covariance=np.asarray(total, dtype=float),
+        known=tuple(_known(inexact, theta, sigmas, np.sqrt(np.diag(covariance)), estimated)),
+        contributions={
+            one.what: through[:, at]
+            @ np.diag(np.where(np.isfinite(one.sigmas), one.sigmas, 0.0) ** 2)
+            @ through[:, at].T
+            for one, at in zip(inexact, _slices(inexact), strict=True)
+        },
+    )
+
+
+def _information(
+    data: CaptureArrays,
+    knowns: Knowns,
+    noise: Noise,
+    inexact: Sequence[Inexact],
+    theta: Array,
+    model: Model,
+    fit: Fit,
+) -> tuple[Array, Array, Array]:
+    """Of the cell with the knowns (12, m), of these among themselves (m, m), the arms marginalised from both; gradient
+    (m,) at the fit, where the arms' errors already are at their best.
+    """
+    steps = np.concatenate([_STEP * one.scale for one in inexact])
+    columns = []
+    for i, step in enumerate(steps):
+        ends = []
+        for sign in (1, -1):
+            shifted = theta.copy()
+            shifted[i] += sign * step
+            ends.append(Model(data, _shifted(knowns, inexact, shifted), noise).residuals(fit.state))
+        columns.append((ends[0] - ends[1]).reshape(model.captures, -1) / (2 * step))
+    D = np.stack(columns, axis=-1)
+    at = fit.at
+    r = model.residuals(fit.state).reshape(model.captures, -1)
+    towards_pose = np.swapaxes(model.jacobian(fit.state), 1, 2) @ D
+
+    own = np.einsum("kri,krj->ij", D, D)
+    passive = np.swapaxes(at.towards_passive, 1, 2) @ towards_pose
+    folded = np.linalg.solve(_inner(at.towards_passive, at.pixel_normal), passive)
+    own -= np.einsum("kni,knj->ij", passive, folded)
+    towards_pose = towards_pose - at.pixel_normal @ at.towards_passive @ folded
+
+    summed = np.zeros((model.arrivals, *towards_pose.shape[1:]))
+    np.add.at(summed, model.arrival, towards_pose)
+    active = np.swapaxes(at.towards_active, 1, 2) @ summed
+    folded = np.linalg.solve(_inner(at.towards_active, at.arrival_normal), active)
+    own -= np.einsum("ani,anj->ij", active, folded)
+    summed = summed - at.arrival_normal @ at.towards_active @ folded
+    cross = np.einsum("aci,acm->im", at.towards_cell, summed)
+    return cross.reshape(CELL, -1), own, np.einsum("kri,kr->i", D, r)
+
+
+def _inner(towards: Array, normal: Array) -> Array:
+    return np.asarray(np.eye(towards.shape[-1]) + np.swapaxes(towards, 1, 2) @ normal @ towards)
+
+
+def _inverted(information: Array, size: Array, inexact: Sequence[Inexact]) -> Array:
+    """size (m,): roots of the information there would be if all else were known."""
+    names = [name for one in inexact for name in one.names]
+    free = np.concatenate([~np.isfinite(one.sigmas) for one in inexact])
+    values, axes = np.linalg.eigh(information / np.outer(size, size))
+    if values[0] < _SINGULAR and free.any():
+        hidden = [names[i] for i in np.flatnonzero(free & (np.abs(axes[:, 0]) > 0.3))]
+        raise Degenerate(f"cannot be seen in the captures, so cannot be free: {', '.join(hidden) or 'what was freed'}")
+    return np.asarray((axes / np.maximum(values, _SINGULAR)) @ axes.T / np.outer(size, size))
+
+
+def _shifted(knowns: Knowns, inexact: Sequence[Inexact], theta: Array) -> Knowns:
+    for one, at in zip(inexact, _slices(inexact), strict=True):
+        knowns = one.shifted(knowns, theta[at])
+    return knowns
+
+
+def _slices(inexact: Sequence[Inexact]) -> list[slice]:
+    ends = np.cumsum([0, *(len(one.sigmas) for one in inexact)])
+    return [slice(int(begin), int(end)) for begin, end in pairwise(ends)]
+
+
+def _known(inexact: Sequence[Inexact], theta: Array, prior: Array, posterior: Array, estimated: bool) -> list[Known]:
+    names = [name for one in inexact for name in one.names]
+    return [
+        Known(name, float(value), float(before), float(after if estimated else before), bool(after < UNSEEN * before))
+        for name, value, before, after in zip(names, theta, prior, posterior, strict=True)
+    ]

@@ -1,0 +1,130 @@
+"""Knowns that are not exact: estimated with a prior, freed, or only reckoned with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dualcal_hal.transforms import Array
+from procedures.estimation import Degenerate
+from procedures.estimation.refined import (
+    Inexact,
+    Refined,
+    intrinsics,
+    joint_zeros,
+    link_parameters,
+    refined,
+    square_size,
+    target_mount,
+)
+from tools.benchmarks.refined import NOISES, Cell, reference
+
+NOISE = NOISES[0]
+MOUNT = target_mount(5e-4, float(np.radians(0.1)))
+ZEROS = [joint_zeros("active", [1e-3] * 6), joint_zeros("passive", [1e-3] * 6)]
+LINKS = [link_parameters("active", 6, 2e-4, 3e-4), link_parameters("passive", 6, 2e-4, 3e-4)]
+LENS = intrinsics(1.0, 2.0, [0.01, 0.01, 1e-3, 1e-3, 0])
+
+
+def off(inexact: Sequence[Inexact], rng: np.random.Generator) -> Cell:
+    """The reference cell where the knowns are in truth off by a draw of their sigmas, 3 mm and 3 mrad of what is free;
+    the estimate knows those of the reference.
+    """
+    cell = reference()
+    true = cell.knowns
+    for one in inexact:
+        sigmas = np.where(np.isfinite(one.sigmas), one.sigmas, 3e-3)
+        true = one.shifted(true, rng.normal(0, sigmas))
+    cell = replace(cell, knowns=true)
+    return replace(cell, data=replace(cell.data, pixels=cell.seen()))
+
+
+def estimates(inexact: Sequence[Inexact], runs: int, estimated: bool) -> list[tuple[Array, Refined]]:
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(runs):
+        cell = off(inexact, rng)
+        data = cell.noisy(rng, NOISE)
+        result = refined(
+            data, reference().knowns, NOISE, inexact=inexact, estimate_inexact=estimated, keep_all=not estimated
+        )
+        found.append((cell.error(result.T_P_A, result.T_H_E), result))
+    return found
+
+
+def normalised(found: Sequence[tuple[Array, Refined]]) -> float:
+    return float(np.mean([error @ np.linalg.solve(result.covariance, error) for error, result in found]))
+
+
+@pytest.mark.parametrize(
+    "inexact", [[MOUNT], [target_mount(np.inf, np.inf)], [square_size(1e-3), LENS]], ids=["mount", "free mount", "lens"]
+)
+def test_what_is_estimated_with_its_prior_leaves_errors_that_the_covariance_explains(inexact: list[Inexact]) -> None:
+    """The mean of 4 chi-squares of 12 has a sigma of 2.4."""
+    found = estimates(inexact, 4, estimated=True)
+    assert normalised(found) == pytest.approx(12, abs=7)
+    assert all(result.used.all() for _, result in found)
+
+
+def test_joint_zeros_are_estimated_but_those_that_cannot_be_seen_are_named() -> None:
+    found = estimates(ZEROS, 2, estimated=True)
+    assert normalised(found) < 25
+    hidden = {known.name for known in found[0][1].known if not known.seen}
+    assert hidden == {
+        "zero of joint 1 of the active arm",
+        "zero of joint 6 of the active arm",
+        "zero of joint 1 of the passive arm",
+    }
+    assert any("cannot be seen" in words for words in found[0][1].warnings)
+
+
+def test_of_the_links_the_first_d_and_the_active_arms_last_row_cannot_be_seen() -> None:
+    ((error, result),) = estimates(LINKS, 1, estimated=True)
+    assert error @ np.linalg.solve(result.covariance, error) < 40
+    assert {known.name for known in result.known if not known.seen} == {
+        "d of row 1 of the active arm",
+        "d of row 1 of the passive arm",
+        *(f"{what} of row 6 of the active arm" for what in ("d", "a", "alpha")),
+    }
+
+
+def test_what_is_only_reckoned_with_widens_the_covariance_as_its_errors_do() -> None:
+    """A mount off by more than the noise shows in the residuals too, which widens the covariance further."""
+    found = estimates([MOUNT], 8, estimated=False)
+    plain = reference().bound(NOISE)
+    assert all(result.covariance[0, 0] > 20 * plain[0, 0] for _, result in found)
+    assert normalised(found) < 18
+
+
+@pytest.mark.parametrize(
+    ("one", "name"),
+    [
+        (joint_zeros("passive", [np.inf, 0, 0, 0, 0, 0]), "zero of joint 1 of the passive arm"),
+        (joint_zeros("active", [0, 0, 0, 0, 0, np.inf]), "zero of joint 6 of the active arm"),
+    ],
+)
+def test_what_cannot_be_seen_is_refused_for_freeing(one: Inexact, name: str) -> None:
+    cell = reference()
+    with pytest.raises(Degenerate, match=name):
+        refined(cell.noisy(np.random.default_rng(0), NOISE), cell.knowns, NOISE, inexact=[one])
+
+
+def test_what_is_free_cannot_be_only_reckoned_with() -> None:
+    cell = reference()
+    free = target_mount(np.inf, np.inf)
+    with pytest.raises(ValueError, match="free has to be estimated"):
+        refined(cell.data, cell.knowns, NOISE, inexact=[free], estimate_inexact=False)
+
+
+def test_contributions_add_up_to_the_covariance() -> None:
+    cell = reference()
+    data = cell.noisy(np.random.default_rng(0), NOISE)
+    plain = refined(data, cell.knowns, NOISE)
+    assert set(plain.contributions) == {"pixels", "active joints", "passive joints"}
+    np.testing.assert_allclose(sum(plain.contributions.values()), plain.covariance, rtol=1e-6, atol=1e-14)
+    reckoned = refined(data, cell.knowns, NOISE, inexact=[MOUNT], estimate_inexact=False)
+    np.testing.assert_allclose(sum(reckoned.contributions.values()), reckoned.covariance, rtol=1e-6, atol=1e-14)
+    assert np.trace(reckoned.contributions["target mount"]) > 10 * np.trace(plain.covariance)

@@ -300,7 +300,8 @@ class Engine:
     def _stop_all(self, cause: str) -> None:
         """Stop every arm that was moved, each whatever the others' stops do; StopFailed names those that may move."""
         failures: dict[str, str] = {}
-        for name in sorted(self._moved):
+        # One that moves does not wait until another has confirmed that it stands.
+        for name in sorted(self._moved, key=lambda name: (not self._cell.arm(name).robot.moving, name)):
             try:
                 result = self._cell.arm(name).robot.stop(cause)
             except Exception as error:  # noqa: BLE001 - the other arm must still be stopped; told by StopFailed

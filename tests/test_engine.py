@@ -135,6 +135,17 @@ def test_an_arm_that_cannot_be_stopped_does_not_keep_the_other_from_it(engine, c
     assert [name for name, _ in stops] == ["right"]
 
 
+def test_the_arm_that_moves_is_stopped_first(engine, cell, stops):
+    def procedure():
+        yield from move("left", nearby(cell))
+        cell.clock.call_at(cell.clock.now() + 0.05, lambda: engine.abort("enough"))
+        yield from move("right", tuple(q + 0.5 for q in cell.passive.home))
+
+    with pytest.raises(Interrupted):
+        engine.run(procedure())
+    assert [name for name, _ in stops] == ["right", "left"]
+
+
 def test_a_stop_that_is_not_confirmed_is_no_good_end(engine, cell, monkeypatch):
     monkeypatch.setattr(cell.active.robot, "stop", lambda reason: StopResult(False, "no newer state"))
 

@@ -1,6 +1,6 @@
 """Accuracy of the refined estimate against what is possible at all, over many draws of the noise.
 
-python -m tools.benchmarks.refined bound|cells|outliers|noise [--runs N]
+python -m tools.benchmarks.refined bound|cells|outliers|noise|speed [--runs N]
 """
 
 from __future__ import annotations
@@ -401,6 +401,28 @@ def report_noise(runs: int) -> None:
         print(f"joint within 35 % {joint:.2%}, identified {known:.2%}, below its upper end {below:.2%}")
 
 
+def repeated(cell: Cell, times: int) -> Cell:
+    """The same captures again and again, each time with new arrivals."""
+    data, count = cell.data, len(np.unique(cell.data.arrivals))
+    arrivals = np.concatenate([data.arrivals + count * i for i in range(times)])
+    active, passive = np.tile(data.active, (times, 1)), np.tile(data.passive, (times, 1))
+    return replace(cell, data=CaptureArrays(active, passive, arrivals, np.tile(data.pixels, (times, 1, 1))))
+
+
+def report_speed(runs: int) -> None:
+    clock, noise = RealClock(), NOISES[0]
+    for times in (1, 36, 72):
+        cell = repeated(reference(), times)
+        rng, seconds = np.random.default_rng(0), []
+        for _ in range(runs):
+            data = cell.noisy(rng, noise)
+            begun = clock.now()
+            refined(data, cell.knowns, noise)
+            seconds.append(clock.now() - begun)
+        print(f"{len(cell.data)} captures, start included: median {1e3 * np.median(seconds):.0f} ms", end=", ")
+        print(f"longest {1e3 * max(seconds):.0f} ms of {runs}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="what", required=True)
@@ -409,10 +431,17 @@ def main() -> None:
         ("cells", "random cells without a nominal", 1000),
         ("outliers", "captures that are wrong, and none", 500),
         ("noise", "sigmas found from the captures", 200),
+        ("speed", "time for few and many captures", 20),
     ):
         commands.add_parser(name, help=help_).add_argument("--runs", type=int, default=runs)
     arguments = parser.parse_args()
-    reports = {"bound": report_bound, "cells": report_cells, "outliers": report_outliers, "noise": report_noise}
+    reports = {
+        "bound": report_bound,
+        "cells": report_cells,
+        "outliers": report_outliers,
+        "noise": report_noise,
+        "speed": report_speed,
+    }
     reports[arguments.what](arguments.runs)
 
 

@@ -290,6 +290,8 @@ class _Search:
         worst = _worst(solution, of_captures, of_arrivals)
         used[mine[worst]] = False
         flipped = solution.flipped.copy()
+        if worst.any() or np.array_equal(used, self.usable):
+            return used, flipped
         # What was left out so far comes back where it fits.
         freedom = self.every.freedom
         scale = max(of_captures, of_arrivals)
@@ -298,9 +300,7 @@ class _Search:
         turn = ~solution.used & ~self.data.order & (other < predicted)
         flipped = flipped ^ turn
         predicted = np.where(turn, other, predicted)
-        if not worst.any():
-            used |= self.usable & (predicted < limits(freedom, scale))
-        return used, flipped
+        return used | (self.usable & (predicted < limits(freedom, scale))), flipped
 
 
 def _best_first(solutions: Sequence[_Solution]) -> list[_Solution]:

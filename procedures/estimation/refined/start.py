@@ -26,6 +26,8 @@ from procedures.estimation.refined.resection import camera_poses, plane_poses, r
 _POSE_SCALES = (100.0, 30.0, 10.0, 5.0, 3.0)
 _CELL_SCALES = (100.0, 30.0, 10.0, 5.0, 3.0, 3.0, 3.0)
 
+_WELL = 9.0  # squares in units of sigma, of a number: all fit, there is nothing to weigh down
+
 _MOST_POSES = 3  # kept of an arrival
 _SAME_TURN, _SAME_PLACE = np.radians(1.0), 0.01
 _WORSE = 3.0  # a pose whose captures are this much farther off in the logarithm of their squares is not kept
@@ -36,14 +38,16 @@ _MOST_STARTS = 6
 @dataclass(frozen=True)
 class Poses:
     """Candidates for T_P_E (c, 4, 4) of arrivals (c,); loss (c,); normal (c, 6, 6): information on it from captures
-    that fit; flipped (c, k): captures that fit it from the other end of their corners; weights (c, k) of the captures,
-    0 for those of other arrivals.
+    that fit. Of each candidate with each capture of its arrival, in pairs (p,): of, which: both; flipped: whether it
+    fits from the other end of its corners; weights: 1 if it fits.
     """
 
     arrival: Indices
     T_P_E: Array
     loss: Array
     normal: Array
+    of: Indices
+    which: Indices
     flipped: Mask
     weights: Array
 
@@ -53,13 +57,18 @@ class Poses:
         return self.T_P_E[np.unique(self.arrival, return_index=True)[1], :3, 2]
 
     def only(self, chosen: Indices) -> Poses:
+        place = np.full(len(self.arrival), -1, dtype=np.intp)
+        place[chosen] = np.arange(len(chosen))
+        kept = place[self.of] >= 0
         return Poses(
             self.arrival[chosen],
             self.T_P_E[chosen],
             self.loss[chosen],
             self.normal[chosen],
-            self.flipped[chosen],
-            self.weights[chosen],
+            place[self.of[kept]],
+            self.which[kept],
+            self.flipped[kept],
+            self.weights[kept],
         )
 
 
@@ -133,8 +142,7 @@ def _together(model: Model, T_P_T: Array, rays: Array, seen: Mask) -> tuple[Indi
 
 def _agreed(model: Model, T_P_T: Array, order_known: Mask, arrival: Indices, T_P_E: Array) -> Poses:
     """Poses refined on the captures of their arrival."""
-    pairs = np.argwhere(arrival[:, None] == model.arrival[None])
-    of, which = pairs[:, 0], pairs[:, 1]
+    of, which = _pairs(arrival, model.arrival)
     unsure = np.flatnonzero(~order_known[which])
     freedom = 2.0 * model.seen.sum(axis=1)[which]
     flipped = np.zeros(len(which), dtype=bool)
@@ -156,13 +164,23 @@ def _agreed(model: Model, T_P_T: Array, order_known: Mask, arrival: Indices, T_P
         towards = np.zeros((len(T_P_E), 6))
         np.add.at(towards, of, weights[:, None] * gradient)
         floor = (1e-9 * np.trace(summed, axis1=1, axis2=2) + 1e-9)[:, None, None] * np.eye(6)
-        T_P_E = moved(T_P_E, _held(np.linalg.solve(summed + floor, -towards[..., None])[..., 0]))
+        step = np.linalg.solve(summed + floor, -towards[..., None])[..., 0]
+        T_P_E = moved(T_P_E, _held(step))
+        if off.max(initial=0.0) < _WELL and -np.sum(step * towards, axis=1).min(initial=0.0) < _WELL:
+            break
     loss = np.zeros(len(T_P_E))
     np.add.at(loss, of, np.log1p(np.minimum(off, 1e8)))
-    all_flipped = np.zeros((len(T_P_E), model.captures), dtype=bool)
-    all_weights = np.zeros((len(T_P_E), model.captures))
-    all_flipped[of, which], all_weights[of, which] = flipped, weights
-    return Poses(arrival, T_P_E, loss, summed, all_flipped, all_weights)
+    return Poses(arrival, T_P_E, loss, summed, of, which, flipped, weights)
+
+
+def _pairs(arrival: Indices, of_captures: Indices) -> tuple[Indices, Indices]:
+    """Each candidate with each capture of its arrival."""
+    order = np.argsort(of_captures, kind="stable")
+    begins = np.searchsorted(of_captures[order], arrival, side="left")
+    counts = np.searchsorted(of_captures[order], arrival, side="right") - begins
+    of = np.repeat(np.arange(len(arrival)), counts)
+    within = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return of, order[begins[of] + within]
 
 
 def _sights(model: Model, T_E_T: Array, which: Indices, flipped: Mask) -> tuple[Array, Array, Array]:
@@ -299,12 +317,13 @@ def _best_of_arrival(off: Array, arrival: Indices, arrivals: int) -> Array:
 
 
 def _start(model: Model, poses: Poses, T_P_A: Array, T_H_E: Array, off: Array, loss: float) -> Start:
-    flipped = np.zeros(model.captures, dtype=bool)
-    fits = np.zeros(model.captures, dtype=bool)
-    for a in np.unique(poses.arrival):
-        of = np.flatnonzero(poses.arrival == a)
-        best = of[np.argmin(off[of])]
-        flipped |= poses.flipped[best]
-        if off[best] / 6 < _CELL_SCALES[-1] ** 2:
-            fits |= poses.weights[best] > 0.5
+    best = np.full(model.arrivals, -1, dtype=np.intp)
+    worst_first = np.argsort(-off, kind="stable")
+    best[poses.arrival[worst_first]] = worst_first
+    taken = best[model.arrival[poses.which]] == poses.of
+    which = poses.which[taken]
+    flipped, fits = np.zeros(model.captures, dtype=bool), np.zeros(model.captures, dtype=bool)
+    flipped[which] = poses.flipped[taken]
+    arrival_fits = off[poses.of[taken]] / 6 < _CELL_SCALES[-1] ** 2
+    fits[which] = arrival_fits & (poses.weights[taken] > 0.5)
     return Start(T_P_A, T_H_E, flipped, loss, fits)

@@ -115,7 +115,7 @@ class TestWithoutNominal:
         np.testing.assert_allclose(cell.error(found.T_P_A, found.T_H_E), 0, atol=1e-7)
 
 
-def turned_to(turns: Array, shifts: Array | None = None, seed: int = 0) -> Cell:
+def turned_to(turns: Array, shifts: Array | None = None, seed: int = 0, most_tilt: float = 45.0) -> Cell:
     """The reference cell with the camera turned by rotation vectors (n, 3), in its own frame, from where it first
     stood, and shifted there.
     """
@@ -124,13 +124,47 @@ def turned_to(turns: Array, shifts: Array | None = None, seed: int = 0) -> Cell:
     shifts = rng.uniform(-0.03, 0.03, (len(turns), 3)) if shifts is None else shifts
     T_A_E = moved(chain.forward(first) @ cell.T_H_E, np.concatenate([shifts, turns], axis=1))
     active, reached = chain.inverse(T_A_E @ inverse(cell.T_H_E), np.tile(first, (len(turns), 1)), *LIMITS.T)
-    passive, found = boards(rng, cell.knowns, cell.T_P_A @ T_A_E, 3)
+    passive, found = boards(rng, cell.knowns, cell.T_P_A @ T_A_E, 3, most_tilt)
     good = reached & found
     return cell_of(cell.knowns, cell.T_P_A, cell.T_H_E, active[good], passive[good])
 
 
 FAN = np.radians(np.linspace(-20, 20, 12))[:, None]
 ROLLS = np.radians(np.tile([-30, 20, 0, 35], 3))[:, None]
+
+
+class TestSecondSolution:
+    TURNS = np.random.default_rng(0).uniform(-0.4, 0.4, (10, 3))
+
+    def test_boards_square_to_the_axis_and_of_unknown_order_leave_two_both_of_which_are_told(self) -> None:
+        """A camera turned by half a turn about its axis sees them alike."""
+        cell = turned_to(self.TURNS, most_tilt=0.0)
+        data = replace(cell.noisy(np.random.default_rng(0), NOISE), order_known=np.zeros(len(cell.data), bool))
+        found = refined(data, cell.knowns, NOISE)
+        assert len(found.alternatives) == 1
+        other = found.alternatives[0]
+        assert 1 <= other.ratio < 1.5
+        half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+        np.testing.assert_allclose(found.T_H_E, other.T_H_E @ half_turn, atol=2e-3)
+        np.testing.assert_allclose(found.T_P_A, other.T_P_A, atol=2e-3)
+        assert any("second solution" in words for words in found.warnings)
+
+    def test_there_is_none_where_the_order_is_known_or_boards_are_tilted(self) -> None:
+        square, tilted = turned_to(self.TURNS, most_tilt=0.0), turned_to(self.TURNS)
+        unknown = np.zeros(len(tilted.data), dtype=bool)
+        for cell, data in ((square, square.data), (tilted, replace(tilted.data, order_known=unknown))):
+            found = refined(data, cell.knowns, NOISE)
+            assert found.alternatives == ()
+            np.testing.assert_allclose(cell.error(found.T_P_A, found.T_H_E), 0, atol=1e-6)
+
+    def test_a_bad_further_start_does_no_harm(self) -> None:
+        cell = reference()
+        data = cell.noisy(np.random.default_rng(0), NOISE)
+        data.pixels[3] += 9
+        plain = refined(data, cell.knowns, NOISE)
+        other = refined(data, cell.knowns, NOISE, further_starts=[(np.eye(4), np.eye(4))])
+        np.testing.assert_allclose(other.T_P_A, plain.T_P_A, atol=1e-7)
+        assert np.flatnonzero(~other.used).tolist() == [3]
 
 
 class TestSetsThatSayTooLittle:

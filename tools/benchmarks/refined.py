@@ -232,16 +232,18 @@ def _looks(
     return (active[good[whole]], passive[whole]) if len(whole) == constraints else None
 
 
-def boards(rng: np.random.Generator, knowns: Knowns, T_P_E: Array, positions: int) -> tuple[Array, Mask]:
-    """Passive joints (c, positions, 6) that bring the board before cameras T_P_E (c, 4, 4), and for which they were
-    found (c,).
+def boards(
+    rng: np.random.Generator, knowns: Knowns, T_P_E: Array, positions: int, most_tilt: float = 45.0
+) -> tuple[Array, Mask]:
+    """Passive joints (c, positions, 6) that bring the board before cameras T_P_E (c, 4, 4), tilted by at most so many
+    degrees, and for which they were found (c,).
     """
     lower, upper = LIMITS.T
     tries = 6
     goals = np.empty((len(T_P_E), positions, 4, 4))
     for i, j in np.ndindex(goals.shape[:2]):
         camera, depth = T_P_E[i], np.linspace(0.3, 0.5, positions)[j]
-        turned = _leaning(rng, 45) @ rotation_from_vector([0, 0, rng.uniform(-np.pi, np.pi)])
+        turned = _leaning(rng, most_tilt) @ rotation_from_vector([0, 0, rng.uniform(-np.pi, np.pi)])
         facing = transform(camera[:3, :3] @ np.diag([1.0, -1, -1]) @ turned, camera[:3, 3] + depth * camera[:3, 2])
         goals[i, j] = facing @ inverse(knowns.T_F_T)
     goals = goals.reshape(-1, 4, 4).repeat(tries, axis=0)

@@ -63,15 +63,15 @@ def normalised(found: Sequence[tuple[Array, Refined]]) -> float:
     "inexact", [[MOUNT], [target_mount(np.inf, np.inf)], [square_size(1e-3), LENS]], ids=["mount", "free mount", "lens"]
 )
 def test_what_is_estimated_with_its_prior_leaves_errors_that_the_covariance_explains(inexact: list[Inexact]) -> None:
-    """The mean of 4 chi-squares of 12 has a sigma of 2.4."""
-    found = estimates(inexact, 4, estimated=True)
-    assert normalised(found) == pytest.approx(12, abs=7)
+    """The mean of 3 chi-squares of 12 has a sigma of 2.8."""
+    found = estimates(inexact, 3, estimated=True)
+    assert normalised(found) == pytest.approx(12, abs=8)
     assert all(result.used.all() for _, result in found)
 
 
 def test_joint_zeros_are_estimated_but_those_that_cannot_be_seen_are_named() -> None:
-    found = estimates(ZEROS, 2, estimated=True)
-    assert normalised(found) < 25
+    found = estimates(ZEROS, 1, estimated=True)
+    assert normalised(found) < 40
     hidden = {known.name for known in found[0][1].known if not known.seen}
     assert hidden == {
         "zero of joint 1 of the active arm",
@@ -81,6 +81,7 @@ def test_joint_zeros_are_estimated_but_those_that_cannot_be_seen_are_named() -> 
     assert any("cannot be seen" in words for words in found[0][1].warnings)
 
 
+@pytest.mark.slow
 def test_of_the_links_the_first_d_and_the_active_arms_last_row_cannot_be_seen() -> None:
     ((error, result),) = estimates(LINKS, 1, estimated=True)
     assert error @ np.linalg.solve(result.covariance, error) < 40
@@ -93,10 +94,10 @@ def test_of_the_links_the_first_d_and_the_active_arms_last_row_cannot_be_seen() 
 
 def test_what_is_only_reckoned_with_widens_the_covariance_as_its_errors_do() -> None:
     """A mount off by more than the noise shows in the residuals too, which widens the covariance further."""
-    found = estimates([MOUNT], 8, estimated=False)
+    found = estimates([MOUNT], 3, estimated=False)
     plain = reference().bound(NOISE)
     assert all(result.covariance[0, 0] > 20 * plain[0, 0] for _, result in found)
-    assert normalised(found) < 18
+    assert normalised(found) < 22
 
 
 @pytest.mark.parametrize(

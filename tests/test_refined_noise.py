@@ -55,3 +55,16 @@ def test_outliers_are_not_taken_for_noise() -> None:
     found = refined(data, cell.knowns, STATED, estimate_noise=True)
     assert np.flatnonzero(~found.used).tolist() == [4]
     assert found.noise.pixel == pytest.approx(noise.pixel, rel=0.15)
+
+
+@pytest.mark.parametrize("noise", [Noise(0.1, 3e-4, 3e-4), Noise(0.4, 1e-4, 1e-4)], ids=["joints", "pixels"])
+def test_the_covariance_holds_where_the_noise_was_stated_three_or_four_times_too_small(noise: Noise) -> None:
+    """The mean of 5 chi-squares of 12 has a sigma of 2.2, and what is found of the noise varies too."""
+    cell, rng, squares = reference(), np.random.default_rng(0), []
+    for _ in range(5):
+        found = refined(cell.noisy(rng, noise), cell.knowns, NOISES[0])
+        error = cell.error(found.T_P_A, found.T_H_E)
+        squares.append(error @ np.linalg.solve(found.covariance, error))
+        assert found.scale > 1
+        assert found.used.all()
+    assert np.mean(squares) == pytest.approx(12, abs=7)

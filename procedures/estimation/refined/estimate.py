@@ -73,7 +73,8 @@ class Refined:
 
     directions: of these twelve; condition: of the whitened problem. cost: sum of squares in units of sigma, of
     ``freedom`` degrees of freedom; between and between_freedom: the part in which the arrivals differ from one cell.
-    scale: what the covariance of the stated noise was multiplied by since the data show more, 1 if they do not.
+    scale: by how much squares exceed those of the stated noise, 1 if that may be chance; if it is not, the covariance
+    is that of this estimate under the noise which the captures themselves show, where that is larger.
     residuals (k, n, 2): pixels in units of sigma, NaN for corners not seen and captures not used; distances (k,):
     squared Mahalanobis distance of each capture from where the others put it, NaN for those not used; freedoms (k,):
     its degrees of freedom. flipped (k,): captures taken with their corners from the other end. used (k,).
@@ -162,8 +163,7 @@ def _with_inexact(
 
 def _combined(result: Refined, found: WithInexact, observable: Limits) -> Refined:
     """With the inexact knowns in estimate and covariance; what was widened for the residuals stays so."""
-    of_noise = sum(result.contributions.values(), np.zeros((CELL, CELL)))
-    covariance = found.covariance + of_noise * (1 - 1 / result.scale)
+    covariance = found.covariance - np.linalg.inv(found.fit.at.normal) + result.covariance
     hidden = [known.name for known in found.known if not known.seen]
     words = [f"cannot be seen in the captures: {', '.join(hidden)}"] if hidden else []
     return replace(
@@ -370,7 +370,10 @@ def _result(
     freedom = model.measurements - CELL
     between, between_freedom = between_arrivals(fit)
     scale = max(_excess(fit.at.cost, freedom), _excess(between, between_freedom))
-    covariance: Array = np.asarray(scale * np.linalg.inv(fit.at.normal), dtype=float)
+    contributions = noise_contributions(fit, model.arrival)
+    if scale > 1:
+        contributions = _widened(search, best, contributions, scale)
+    covariance = sum(contributions.values(), np.zeros((CELL, CELL)))
     found = directions(covariance, observable)
     k, n = search.every.seen.shape
     residuals, squares = np.full((k, n, 2), np.nan), np.full(k, np.nan)
@@ -397,8 +400,23 @@ def _result(
         warnings=(*warnings, *_warnings(fit, found, scale, alternatives)),
         noise=search.every.noise,
         knowns=search.every.knowns,
-        contributions={what: scale * part for what, part in noise_contributions(fit, model.arrival).items()},
+        contributions=contributions,
     )
+
+
+def _widened(search: _Search, best: _Solution, contributions: dict[str, Array], scale: float) -> dict[str, Array]:
+    """What each source contributes when it is as large as the captures show it, if that is larger than stated."""
+    stated, state = search.every.noise, best.fit.state
+    kept = search.data.turned(best.flipped).only(best.used)
+    found = find_noise(kept, search.every.knowns, stated, state.T_P_A, state.T_H_E).noise
+    if min(stated.active, stated.passive) == 0:
+        return {what: scale * part for what, part in contributions.items()}
+    ratios = {
+        "pixels": found.pixel / stated.pixel,
+        "active joints": found.active / stated.active,
+        "passive joints": found.passive / stated.passive,
+    }
+    return {what: max(1.0, ratios[what]) ** 2 * part for what, part in contributions.items()}
 
 
 def _excess(squares: float, freedom: int) -> float:

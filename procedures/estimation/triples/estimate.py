@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,9 +82,12 @@ class TripleEstimate:
         return np.asarray(Ad @ self.covariance_of("Y") @ Ad.T)
 
 
-def estimate_triples(A: ArrayLike, B: ArrayLike, C: ArrayLike, noise: TripleNoise) -> TripleEstimate:
+def estimate_triples(
+    A: ArrayLike, B: ArrayLike, C: ArrayLike, noise: TripleNoise, names: Sequence[str] | None = None
+) -> TripleEstimate:
     """Maximum likelihood from triples (n, 4, 4), m, with the errors of A and C marginalised; no start is needed.
 
+    names (n): what a warning calls them, their index from 0 for None.
     Raises Degenerate, with the reason, for triples that do not determine X, Y and Z; ValueError for poses that are no
     rigid transforms, for different numbers of them, and for a noise that is of another number.
     """
@@ -119,7 +123,7 @@ def estimate_triples(A: ArrayLike, B: ArrayLike, C: ArrayLike, noise: TripleNois
         start=start,
         conditioning=condition,
         rise=rise,
-        warnings=_warnings(at, covariance, scale, noise_fits, rise),
+        warnings=_warnings(at, covariance, scale, noise_fits, rise, names or range(len(A))),
     )
 
 
@@ -146,11 +150,17 @@ def _judge_noise(cost: float, freedom: int) -> tuple[float, bool]:
     return float(np.sqrt(cost / freedom)), bool(fits)
 
 
-def _warnings(at: Linearised, covariance: Array, scale: float, noise_fits: bool, rise: float) -> tuple[str, ...]:
+def _warnings(
+    at: Linearised, covariance: Array, scale: float, noise_fits: bool, rise: float, names: Sequence[object]
+) -> tuple[str, ...]:
     said = []
     if not noise_fits:
         share = at.squares.max() / at.cost
-        worst = f"; triple {int(at.squares.argmax())} alone has {100 * share:.0f} % of the cost" if share > 0.2 else ""
+        worst = (
+            f"; triple {names[int(at.squares.argmax())]} alone has {100 * share:.0f} % of the cost"
+            if share > 0.2
+            else ""
+        )
         said.append(f"the residuals are {scale:.3g} times what the stated noise explains{worst}")
     if uncertain := weakest(covariance, WEAK):
         said.append(f"{uncertain}: turn both flanges by more, about two axes each, or take more triples")

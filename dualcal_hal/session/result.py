@@ -93,7 +93,7 @@ class Result:
         return {
             "format": FORMAT,
             "method": self.method,
-            "transforms": {T_P_A_NAME: _transform(self.T_P_A), T_H_E_NAME: _transform(self.T_H_E)},
+            "transforms": {T_P_A_NAME: transform_document(self.T_P_A), T_H_E_NAME: transform_document(self.T_H_E)},
             "optical_axis_in_active_flange": self.optical_axis.tolist(),
             "unobservable": [{"what": u.what, "direction": list(u.direction), "of": u.of} for u in self.unobservable],
             "iterations": [dict(iteration) for iteration in self.iterations],
@@ -158,7 +158,8 @@ def with_truth_error(result: Result, truth: Mapping[str, Array]) -> Result:
     return replace(result, truth_error=error)
 
 
-def _transform(T: Array) -> dict[str, Any]:
+def transform_document(T: Array) -> dict[str, Any]:
+    """A transform (4, 4), m, as public files have it."""
     return {
         "matrix": T.tolist(),
         "translation_mm": (1e3 * T[:3, 3]).tolist(),

@@ -11,6 +11,7 @@ from procedures.report.tables import (
     result_tables,
     way_table,
 )
+from procedures.report.triples import triples_tables
 
 __all__ = [
     "draw_plan",
@@ -21,5 +22,6 @@ __all__ = [
     "plan_table",
     "posture_table",
     "result_tables",
+    "triples_tables",
     "way_table",
 ]

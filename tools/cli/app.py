@@ -105,7 +105,12 @@ def run(
 
 @app.command()
 def estimate(
-    captures: Annotated[Path, typer.Argument(metavar="CAPTURES|SESSION", help="captures.json or a session folder.")],
+    captures: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CAPTURES|SESSION|TRIPLES", help="captures.json, a session folder, or pose triples (JSON or CSV)."
+        ),
+    ],
     cell: Annotated[Path | None, typer.Option(help="The cell file; a session brings its own.")] = None,
     method: Method = None,
     truth: Annotated[Path | None, typer.Option(help="JSON {transform name: 4x4, m} to compare with.")] = None,
@@ -113,16 +118,28 @@ def estimate(
     redetect: Annotated[
         bool, typer.Option("--redetect", help="Detect the target anew in the session's recorded images.")
     ] = False,
+    sigma_a: Annotated[
+        str | None, typer.Option(metavar="MM,DEG", help="Triples: sigma per axis of A, the active flange in its base.")
+    ] = None,
+    sigma_b: Annotated[
+        str | None, typer.Option(metavar="MM,DEG", help="Triples: sigma per axis of B, the target in the camera.")
+    ] = None,
+    sigma_c: Annotated[
+        str | None, typer.Option(metavar="MM,DEG", help="Triples: sigma per axis of C, the passive flange in its base.")
+    ] = None,
     json: Json = False,
 ) -> None:
-    """Estimate and verify from captures, without any device.
+    """Estimate and verify from captures, without any device; or from pose triples of AXB = YCZ, without a cell.
 
-    Exit code 0 once there is a result, 2 for a call, cell file or captures that cannot be used.
+    How exact the poses of triples are stands in their file, or is given with --sigma-a, --sigma-b and --sigma-c.
+
+    Exit code 0 once there is a result, 2 for a call, cell file, captures or triples that cannot be used.
     """
     with ended_in_order():
         from tools.cli.estimate import EstimateOptions, estimate_captures
 
-        estimate_captures(EstimateOptions(captures, cell, method, truth, out, redetect, json))
+        sigmas = {"A": sigma_a, "B": sigma_b, "C": sigma_c}
+        estimate_captures(EstimateOptions(captures, cell, method, truth, out, redetect, json, sigmas))
 
 
 @app.command()

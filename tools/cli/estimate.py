@@ -20,6 +20,7 @@ from procedures.calibrate import captures_of, finished
 from procedures.redetection import detect_anew
 from tools.cli.show import show_result
 from tools.cli.terminal import Screen
+from tools.cli.triples import TriplesOptions, estimate_from_triples, holds_triples
 from tools.cli.truth import simulated_truth
 
 SOURCES = ("captures.json", "cell.yaml", "journal.jsonl", "plan.json")
@@ -37,13 +38,19 @@ class EstimateOptions:
     out: Path | None
     redetect: bool
     json: bool
+    sigmas: Mapping[str, str | None]  # of pose triples alone, by A, B, C
 
 
 def estimate_captures(options: EstimateOptions) -> None:
-    """Analyse captures from anywhere; print the result and write it where asked."""
+    """Analyse captures, or pose triples, from anywhere; print the result and write it where asked."""
     if not options.captures.exists():
         raise UsageError(f"{options.captures}: does not exist")
     _check_out(options)
+    triples = holds_triples(options.captures)
+    _refuse_unfit(options, triples=triples)
+    if triples:
+        estimate_from_triples(TriplesOptions(options.captures, options.sigmas, options.out, options.json))
+        return
     file = load_cell(_cell_path(options), meshes=False, backends=False)
     captures, unfinished = _captures(options.captures, file)
     console = Screen(stderr=options.json)
@@ -72,6 +79,21 @@ def estimate_captures(options: EstimateOptions) -> None:
     show_result(console, file.cell, result, truth, as_json=options.json)
     if options.out is None:
         console.print("Not written to a file; --out FILE does that.")
+
+
+def _refuse_unfit(options: EstimateOptions, *, triples: bool) -> None:
+    """Options that say something of captures where there are triples, or the other way round."""
+    of_captures = {
+        "--cell": options.cell is not None,
+        "--method": options.method is not None,
+        "--truth": options.truth is not None,
+        "--redetect": options.redetect,
+    }
+    of_triples = {f"--sigma-{name.lower()}": sigma is not None for name, sigma in options.sigmas.items()}
+    unfit = ", ".join(name for name, given in (of_captures if triples else of_triples).items() if given)
+    if unfit:
+        here, there = ("pose triples", "captures") if triples else ("captures", "pose triples")
+        raise UsageError(f"{options.captures}: has {here}; leave out what is for {there}: {unfit}")
 
 
 def _cell_path(options: EstimateOptions) -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import pytest
 
 from backends.controller.emulator.braking import Braking
@@ -44,6 +46,22 @@ def test_after_late_cycles_it_is_braked_since_it_goes_on_slower() -> None:
 @pytest.mark.parametrize("word", [QUICK_STOP, HALT, 0x00, 0x06])
 def test_a_drive_that_is_to_follow_no_more_is_stopped_at_once(word: int) -> None:
     assert seen((0x06, 0), (FOLLOW, 0), (FOLLOW, 10), (word, 20)) == [(3, 3.0)]
+
+
+def test_a_drive_that_has_rebooted_was_not_told_to_stop() -> None:
+    rig = Rig(joints=2)
+    rig.nmt(1)
+    stops: list[float] = []
+    rig.drives.on_stop = stops.append
+    for node in (1, 2):
+        rig.enable(node=node)
+    for target in (10, 20, 30):
+        rig.send(0x202, struct.pack("<Hbi", FOLLOW, 8, target))
+        rig.cycle(FOLLOW, target)
+    rig.drives.drives[1].reboot()
+    for target in (40, 50, 60):
+        rig.cycle(FOLLOW, target)
+    assert stops == []
 
 
 def test_drives_tell_of_it() -> None:

@@ -15,20 +15,22 @@ class Braking:
     """Looks at what the drives of one arm are told from SYNC to SYNC."""
 
     def __init__(self) -> None:
-        self._before: Sequence[tuple[int, int]] = ()
+        self._before: Sequence[tuple[int, int] | None] = ()
         self._step = 0
         self._rests = 0
         self._slower_since: float | None = None
 
-    def look(self, now: float, told: Sequence[tuple[int, int]]) -> float | None:
-        """``told``: controlword and target of each drive. Since when they are being stopped, once that can be said.
+    def look(self, now: float, told: Sequence[tuple[int, int] | None]) -> float | None:
+        """``told``: controlword and target of each drive, None of one that hears nothing. Since when they are being
+        stopped, once that can be said.
 
         That is when one is to follow no more, or, once the targets rest, when they began to come slower and slower.
         """
         before, self._before = self._before, told
-        if any(was & _OF == _LED != word & _OF for (was, _), (word, _) in zip(before, told, strict=bool(before))):
+        pairs = [(was, word) for was, word in zip(before, told, strict=bool(before)) if was and word]
+        if any(was & _OF == _LED != word & _OF for (was, _), (word, _) in pairs):
             return now
-        step = max((abs(target - was) for (_, was), (_, target) in zip(before, told, strict=bool(before))), default=0)
+        step = max((abs(target - was) for (_, was), (_, target) in pairs), default=0)
         if step == 0:
             self._rests += 1
         elif step >= self._step:

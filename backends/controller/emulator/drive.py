@@ -124,6 +124,11 @@ class Drive:
         self.axis.on_sync(now)
         self.axis.advance(now)
 
+    @property
+    def told(self) -> tuple[int, int] | None:
+        """The controlword and the target that came last, None while it hears none."""
+        return self.axis.told if self._is(_OPERATIONAL) else None
+
     # What happens by itself
 
     def watch(self, now: float) -> None:

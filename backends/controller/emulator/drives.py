@@ -159,7 +159,7 @@ class ArmDrives:
         for drive in self.drives:
             drive.on_sync(now)
         self._command(next((axis.period for axis in self._axes if axis.is_cyclic), TICK))
-        if (since := self._braking.look(now, [axis.told for axis in self._axes])) is not None:
+        if (since := self._braking.look(now, [drive.told for drive in self.drives])) is not None:
             self.on_stop(since)
 
     def _on_nmt(self, data: bytes) -> None:

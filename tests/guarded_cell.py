@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
@@ -46,15 +49,26 @@ NEVER = threading.Event()
 @cache
 def wired_cell(link: str, *overrides: str) -> CellFile:
     """The tiny cell with a controller over ``link``: a dialect of TCP, or can."""
+    return load_cell(Path(TINY), [*wired(link), *overrides])
+
+
+def wired(link: str) -> list[str]:
+    """What makes it one."""
     if link == "can":
         drives = ", ".join(f"{{node: {node}, counts_per_rad: 1000000}}" for node in NODES)
         arms = ", ".join(f"{arm}: {{channel: '127.0.0.1:1/{arm}', drives: [{drives}]}}" for arm in ARMS)
         can = f"{{interface: socketcand, sync_period_ms: {UNHURRIED_MS}, arms: {{{arms}}}}}"
-        tiny = [f"backends.cell={{type: controller, link: {{can: {can}}}}}"]
-        tiny = [tcp_overrides()[0], *tiny, *tcp_overrides()[1:]]
-    else:
-        tiny = tcp_overrides(f"dialect: {link}")
-    return load_cell(Path(TINY), [*tiny, *overrides])
+        backends, *devices = tcp_overrides()
+        return [backends, f"backends.cell={{type: controller, link: {{can: {can}}}}}", *devices]
+    return tcp_overrides(f"dialect: {link}")
+
+
+def ports_of(endpoints: Mapping[str, Any]) -> dict[tuple[str, str], int]:
+    """By arm and what is there, from what an emulator says of a controller."""
+    if "can" in endpoints:
+        arms = endpoints["can"]["arms"]
+        return {(arm, BUS): int(arms[arm]["channel"].partition(":")[2].partition("/")[0]) for arm in ARMS}
+    return {(arm, port): endpoints["tcp"][arm][port] for arm in ARMS for port in PORTS}
 
 
 class Faults:
@@ -94,12 +108,11 @@ class Served:
         self.faults = Faults()
         if options.link.tcp is not None:
             servers = SimpleMessageServers(options.link.tcp, file.cell, self.world.arms, self.faults, free_ports=True)
-            self.ports = {(arm, port): at[port] for arm, at in servers.endpoints.items() for port in PORTS}
+            self.ports = ports_of({"tcp": servers.endpoints})
             self._close = servers.close
         else:
             buses = DriveBuses(options.link.can, self.world.arms, self.world.clock)
-            channel = buses.endpoints["arms"]["left"]["channel"]
-            self.ports = {(arm, BUS): int(channel.partition(":")[2].partition("/")[0]) for arm in ARMS}
+            self.ports = ports_of({"can": buses.endpoints})
             for arm in ARMS:
                 buses.arms[arm].on_stop = partial(self.faults.stopped, arm)
                 for fault in FAULTS:
@@ -147,9 +160,13 @@ class Guarded:
     def serve(self, *overrides: str) -> Served:
         """Have a server there from now on."""
         self.served = Served(self._link, *overrides)
-        for place, relay in self.relays.items():
-            relay.target = ("127.0.0.1", self.served.ports[place])
+        self.reach(self.served.ports)
         return self.served
+
+    def reach(self, ports: Mapping[tuple[str, str], int]) -> None:
+        """Connect to what is there from now on."""
+        for place, relay in self.relays.items():
+            relay.target = ("127.0.0.1", ports[place])
 
     def kill(self) -> None:
         """Have none there any more."""
@@ -229,6 +246,27 @@ class Guarded:
         return {
             "tcp": {arm: {"host": "127.0.0.1", **{port: self.relays[arm, port].port for port in PORTS}} for arm in ARMS}
         }
+
+
+class Emulating:
+    """``dualcal emulate`` of such a cell in a process of its own. ports: as its endpoints say."""
+
+    def __init__(self, link: str, *overrides: str) -> None:
+        settings = [part for setting in (*wired(link), *overrides) for part in ("--set", setting)]
+        command = [sys.executable, "-m", "tools.cli", "emulate", str(TINY), *settings, "--free-ports"]
+        self._process = subprocess.Popen(
+            [*command, "--until-stdin-closes"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+        )
+        assert self._process.stdout is not None
+        self.ports = ports_of(json.loads(self._process.stdout.readline())["backends"]["cell"])
+
+    def kill(self) -> None:
+        """As nothing can be kept from."""
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            pipe.close()
 
 
 @contextmanager

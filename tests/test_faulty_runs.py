@@ -14,7 +14,7 @@ import pytest
 from backends.controller.can.configuration import HEARTBEAT_LOST
 from backends.controller.tcp.dialects import STOP_BEHIND
 from dualcal_hal.errors import CommandRefused, DeviceError
-from tests.guarded_cell import ARMS, BUS, MOTION, UNHURRIED_MS, Guarded, guarded, wired_cell
+from tests.guarded_cell import ARMS, BUS, MOTION, MOVES, UNHURRIED_MS, UNMOVED, Emulating, Guarded, guarded, wired_cell
 from tests.running import gone_on_with, kill, running
 from tests.simple_message_client import PATIENCE
 from tools.benchmarks.faults import cases, tried
@@ -94,6 +94,30 @@ def test_nor_does_one_that_is_restarted_between_moves(link: str) -> None:
         cell.stays(cell.served.places())
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("link", ["rep", "can"])
+def test_nor_does_one_in_another_process_that_is_killed_and_started_anew(link: str) -> None:
+    cell, emulator = Guarded(link), Emulating(link)
+    try:
+        cell.reach(emulator.ports)
+        cell.open()
+        path = cell.guard.path("left", HOME, ((HOME[0] + AWAY[0], *HOME[1:]),))
+        motion = cell.arms["left"].start(path)
+        cell.reads("left", lambda state: abs(state.positions[0] - HOME[0]) > MOVES)
+        emulator.kill()
+        with pytest.raises(DeviceError, match=r"(left|right): "):
+            motion.wait(PATIENCE)
+        emulator = Emulating(link, "robots.left.home_deg=[20, 0, 60, 0, 30, 0]")
+        cell.reach(emulator.ports)
+        state = cell.reads("left", lambda state: np.rad2deg(state.positions[0]) == pytest.approx(20, abs=0.1))
+        cell.pause(1.0)
+        assert cell.reads("left").positions == pytest.approx(state.positions, abs=UNMOVED)
+        gets_nothing_that_moves(cell, link)
+    finally:
+        emulator.kill()
+        cell.close()
+
+
 # Whole runs
 
 
@@ -171,6 +195,11 @@ def stays_where_it_is(cell: Guarded, link: str) -> None:
         cell.reads(arm)
     cell.stays(cell.served.places(), 1.0)
     assert not any(arm.motions for arm in cell.served.world.arms.values())
+    gets_nothing_that_moves(cell, link)
+
+
+def gets_nothing_that_moves(cell: Guarded, link: str) -> None:
+    """What its clients have sent since they came back."""
     for arm in ARMS:
         if link == "can":
             words = controlwords(cell.relays[arm, BUS].sent[-1])

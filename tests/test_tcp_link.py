@@ -634,6 +634,21 @@ def test_a_refused_first_point_is_a_refused_command() -> None:
         link.send(course(0.3))
 
 
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_refusal_is_told_with_what_status_says_next(number: int) -> None:
+    def refuse(server: SmallServer, message: Received) -> bytes:
+        server.status = replace(server.status, in_error=1, error_code=34252)
+        return server.packet(11, 3, 2)
+
+    with arm("rep", refusing(number, rep, refuse)) as (link, _):
+        try:
+            error: BaseException | None = ended(link.send(course(0.5))).error
+        except CommandRefused as refused:
+            error = refused
+        assert isinstance(error, CommandRefused)
+        assert error.__notes__ == ["left: error 34252 of the controller"]
+
+
 @pytest.mark.parametrize("dialect", ["rep", "fanuc"])
 def test_a_refused_point_on_the_way_fails_the_course_and_has_the_arm_stop(dialect: str) -> None:
     def refuse(server: SmallServer, message: Received) -> bytes:

@@ -89,12 +89,7 @@ _ON_CAN = (
     Case("lost-link", _MOVING, "link", _ARM + r".*the bus .* failed"),
 )
 
-_CONDITIONS = {
-    "estop": "emergency stop",
-    "mode": "(manual mode|not in remote mode)",
-    "drive-fault": "(34252|5001: alarm)",
-}
-_REFUSED = "(the controller refused message|an emergency stop|manual mode|34252)"
+_CONDITIONS = {"estop": "emergency stop", "mode": "(manual mode|remote mode)", "drive-fault": "(34252|5001: alarm)"}
 
 
 def cases(link: str) -> Iterator[Case]:
@@ -105,7 +100,7 @@ def cases(link: str) -> Iterator[Case]:
     for fault, words in _CONDITIONS.items():
         yield Case(fault, _MOVING, "STATUS", _ARM + f".*{words}")
         if link in KEEPS_SPEED:  # the others take points whatever is wrong
-            yield Case(fault, _STREAMING, "reply", _ARM + f".*{_REFUSED}")
+            yield Case(fault, _STREAMING, "reply", _ARM + f".*{words}")
     yield Case("drop", _STREAMING, "no reply", _ARM + ".*no reply in time")
     yield Case("delay", _STREAMING, "no reply", None if link == "fanuc" else _ARM + ".*no reply in time")
     yield Case("delay", f"{_STREAMING}~0.3", "-", None)

@@ -21,7 +21,7 @@ class HandOver:
     """One arm's, on a thread of its own. ``taken(time)`` is told whenever the controller has taken something.
 
     needed: how many messages have to be taken before the arm moves. Where it fails on the way, for another reason
-    than a stop, it has the arm stop.
+    than a stop, it has the arm stop, and then ``explain`` may add to the error what is known.
     """
 
     def __init__(
@@ -34,6 +34,7 @@ class HandOver:
         dialect: Dialect,
         clock: Clock,
         taken: Callable[[float], None],
+        explain: Callable[[DeviceError], None],
     ) -> None:
         self.transfer = Transfer()
         self.running = True
@@ -42,6 +43,7 @@ class HandOver:
         self._packets = [(message, port.packet(arm, message)) for message in messages]
         self._needed = needed
         self._taken = taken
+        self._explain = explain
         self._lock = threading.Lock()
         self._halted = threading.Event()
         self._error: DeviceError | None = None
@@ -92,6 +94,7 @@ class HandOver:
             if not isinstance(error, MotionStopped):
                 with suppress(DeviceError):  # the failure itself is told
                     self._port.stop(self._arm, self._dialect.stop(self._group))
+                self._explain(error)
             self.transfer.failed(error)
         self._ended_or_accepted.set()
 

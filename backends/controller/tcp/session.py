@@ -38,6 +38,7 @@ from dualcal_hal.robot import Mode
 
 _REPORT_WITHIN = 1.0  # s for a report that is newer than the connection
 _STATUS_WITHIN = 0.5  # s after the first report; some servers send none
+_EXPLAINED_WITHIN = 0.25  # s; the slowest servers send one each 0.2 s
 
 _AT_THE_PENDANT = {
     "enable": "switch the drives on at the pendant, in automatic mode",
@@ -127,6 +128,7 @@ class SimpleMessageArm(ArmLink):
                 self._dialect,
                 self._clock,
                 self._feedback.moves_until,
+                self._explain,
             )
         self._feedback.moves_until(self._clock.now())
         handover.begin()
@@ -203,6 +205,17 @@ class SimpleMessageArm(ArmLink):
     def _moves(self) -> bool:
         """Whether it may be on a course."""
         return self._handover is not None and (self._handover.running or self._feedback.may_move())
+
+    def _explain(self, refused: DeviceError) -> None:
+        """Servers refuse without a reason; the next STATUS has it."""
+        if not isinstance(refused, CommandRefused):
+            return
+        deadline = self._clock.now() + _EXPLAINED_WITHIN
+        with suppress(DeviceError):
+            while self._feedback.mode is Mode.READY:
+                self._feedback.report_after(self._clock.now(), deadline)
+            why, _ = condition.why_not(self._feedback.status, self._feedback.mode)
+            refused.add_note(f"{self.arm}: {why}")
 
     # -- what has to be so before -------------------------------------------------------------------------------
 

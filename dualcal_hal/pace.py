@@ -19,6 +19,7 @@ REDUCED_SPEED = 0.250
 
 _STEP = 0.02  # rad; over it a chord is shorter than its arc by less than 2e-5
 _CHORDS = 1.0001
+_NO_MOVE = 1e-12  # rad
 _AIM = 0.98  # of a bound: what is read of where an arm stands scatters, and the bound is held against it once more
 
 
@@ -96,7 +97,7 @@ def _segments(body: ArmBody, start: ArrayLike, path: JointPath) -> Iterator[_Seg
     points = np.array([start, *path.waypoints], dtype=float)
     for begin, end in itertools.pairwise(points):
         way = end - begin
-        if not np.any(way):
+        if np.max(np.abs(way)) < _NO_MOVE:
             continue
         steps = 1 + int(np.ceil(np.max(np.abs(way)) / _STEP))
         shares = np.linspace(0.0, 1.0, steps + 1)

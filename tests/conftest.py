@@ -16,6 +16,31 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _GRACE = 1.0  # s in which a thread that was told to end may do so
 
 
+KEEP_TIME = (
+    "contract/",
+    "test_camera_",
+    "test_can_",
+    "test_controlled_robot",
+    "test_emulat",
+    "test_faulty_runs",
+    "test_first_motion",
+    "test_over_wires",
+    "test_socketcand_hub",
+    "test_tcp_",
+    "test_watch",
+)
+"""Tests on real clocks and wires: two of them side by side would be late for each other's sake."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A worker takes whole files, so that fixtures of a module are made once, and one takes all that keep time."""
+    folder = Path(__file__).parent
+    for item in items:
+        file = item.path.relative_to(folder).as_posix()
+        item.add_marker(pytest.mark.xdist_group("keeps time" if file.startswith(KEEP_TIME) else file))
+
+
 @pytest.fixture(autouse=True)
 def _nothing_left_behind() -> Iterator[None]:
     threads, sockets = set(threading.enumerate()), _sockets()

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from backends.controller.joint_map import JointMap
 from backends.controller.link import ArmLink
 from backends.controller.options import CAN_NEEDS, ControllerOptions, Link
-from backends.controller.promptness import spare_the_heap
+from backends.controller.promptness import before_others, spare_the_heap
 from backends.controller.robot import ControlledRobot, OwnSpeed
 from dualcal_hal.backend import Backend
 from dualcal_hal.camera import Camera
@@ -71,6 +71,7 @@ class ControllerBackend(Backend):
         deadline = self._clock.now() + timeout
         links = self._links()
         with ExitStack() as if_it_fails:
+            if_it_fails.enter_context(before_others())
             for arm, link in ((arm, links[arm]) for arm in arms):
                 if_it_fails.callback(link.close)
                 link.open(deadline)

@@ -72,9 +72,21 @@ def prompt_thread() -> Iterator[bool]:
 
 
 def go_before_others() -> None:
-    """Have this process, and the threads it starts from here on, go before the machine's other work where permitted."""
+    """Have the calling thread, and those it starts from here on, go before the machine's other work where permitted."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, _BEFORE_OTHERS)
+
+
+@contextmanager
+def before_others() -> Iterator[None]:
+    """The same, until it is left: the interpreter's other threads wait for this one, however prompt they are."""
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    go_before_others()
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, before)
 
 
 def spare_the_heap() -> None:

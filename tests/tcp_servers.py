@@ -176,12 +176,14 @@ class SmallServer:
                 made.close()
 
     def _state(self, made: socket.socket) -> None:
+        due = CLOCK.now()
         while not self._closing.is_set():
             if not self.quiet.is_set():
                 data = self.joints_packets() + (self.status_packet() if self.tells_status else b"")
                 for chunk in self.state_chunks(data):
                     made.sendall(chunk)
-            CLOCK.wait(self._closing, CLOCK.now() + self.period)
+            due = max(due + self.period, CLOCK.now())
+            CLOCK.wait(self._closing, due)
 
     def _motion(self, made: socket.socket) -> None:
         while (head := _exactly(made, 4)) is not None:

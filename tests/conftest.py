@@ -38,7 +38,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     folder = Path(__file__).parent
     for item in items:
         file = item.path.relative_to(folder).as_posix()
-        item.add_marker(pytest.mark.xdist_group("keeps time" if file.startswith(KEEP_TIME) else file))
+        if file.startswith(KEEP_TIME):
+            item.add_marker(pytest.mark.keeps_time)
+            file = "keeps time"
+        item.add_marker(pytest.mark.xdist_group(file))
 
 
 @pytest.fixture(autouse=True)

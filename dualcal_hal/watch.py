@@ -17,6 +17,9 @@ from dualcal_hal.transforms import Array
 FEEDBACK_PERIODS, LEAST_FEEDBACK_AGE = 3.0, 0.1
 """Feedback is too old after this many of its periods, and not before this many seconds."""
 
+OWN_WORD_FIRST = 0.1
+"""Seconds more that the device itself has to tell of it: its driver keeps the same rule, and knows what has failed."""
+
 PERIOD_KNOWN_WITHIN = 0.5
 """Seconds for which no state may come before the period of the feedback is known: the slowest controllers tell ten a
 second."""
@@ -192,7 +195,7 @@ class _Feedback:
         return next((state for state in reversed(tuple(self._past)) if state.time <= time), None)
 
     def wrong(self, arm: str, now: float) -> DeviceError | None:
-        age, allowed = now - self._arrived, max(LEAST_FEEDBACK_AGE, FEEDBACK_PERIODS * self._period)
+        age, allowed = now - self._arrived, max(LEAST_FEEDBACK_AGE, FEEDBACK_PERIODS * self._period) + OWN_WORD_FIRST
         if not self._period:
             allowed = PERIOD_KNOWN_WITHIN
         if age > allowed:

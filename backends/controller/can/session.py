@@ -404,7 +404,7 @@ class CanArmLink(ArmLink):
         with self._commanding:
             cycle = self._running("enable")
             if faults := cycle.faults:
-                why, advice = "; ".join(faults), f"dualcal reset ... --arm {self.arm} first"
+                why, advice = "; ".join(faults), f"dualcal reset CELL --arm {self.arm} first"
                 raise CommandRefused(self.arm, "enable", f"in fault: {why}", advice)
             cycle.forget_emergencies()
             cycle.want(Goal.ON)

@@ -23,7 +23,7 @@ from dualcal_hal.session.lock import LOCK, SessionLock
 from dualcal_hal.transforms import rotation_angle
 from procedures.planning.ways import WayFinder
 from tests.test_run import dualcal, sets
-from tools.benchmarks.kills import differences_from, kill_many, survive
+from tools.benchmarks.kills import differences_from, kill_many, once_journalled, survive
 
 TINY = Path(__file__).parent.parent / "cells" / "tiny.yaml"
 LEFT_BEHIND = ("result.json", "summary.png", "captures.json", "distances.json")
@@ -194,7 +194,7 @@ def test_in_physics_a_run_that_goes_on_comes_to_the_same_within_a_hundredth_of_a
 
 
 def test_a_run_that_is_killed_goes_on_to_the_same_and_keeps_what_it_reported(session, tmp_path):
-    moments = iter([4.0, None])
+    moments = iter([once_journalled(tmp_path / "s", steps=8), None])
     trial = survive(TINY, (), tmp_path / "s", session, lambda: next(moments))
     assert trial.wrong == []
     assert len(trial.kills) == 1

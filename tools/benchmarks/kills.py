@@ -28,6 +28,9 @@ from procedures.calibrate import captures_of
 
 CELL = Path("cells/tiny.yaml")
 
+Moment = Callable[[], bool]
+"""Whether it has come."""
+
 _AGAIN = 0.4  # the chance that a run that goes on is killed too
 _POINT = re.compile(r"^(\w+/\d+) position (\d+)/\d+: aligned ", re.MULTILINE)
 
@@ -47,9 +50,9 @@ class Trial:
 
 
 def survive(
-    cell: Path, overrides: Sequence[str], folder: Path, reference: Path, moment: Callable[[], float | None]
+    cell: Path, overrides: Sequence[str], folder: Path, reference: Path, moment: Callable[[], Moment | None]
 ) -> Trial:
-    """Run a cell in ``folder`` and kill it after ``moment()`` seconds, until that gives None; compare with a whole run.
+    """Run a cell in ``folder`` and kill it at ``moment()``, until that gives None; compare with a whole run.
 
     ``reference``: the session of a run of the same cell that nothing has interrupted.
     """
@@ -80,22 +83,41 @@ def differences_from(folder: Path, reference: Path, reported: set[str]) -> list[
     return [*_missing(folder, reported), *differing, *_damage(folder)]
 
 
-def _run(arguments: Sequence[str], moment: float | None) -> tuple[int | None, str, str, float]:
-    """``dualcal run``, killed after so many seconds: its exit code (None if it was), its outputs, how long it ran."""
+def after(seconds: float) -> Moment:
+    """So many seconds from the start."""
+    begun = perf_counter()
+    return lambda: perf_counter() - begun >= seconds
+
+
+def once_journalled(folder: Path, steps: int) -> Moment:
+    """When the session in ``folder`` has so many lines in its journal."""
+    journal = folder / "journal.jsonl"
+    return lambda: journal.exists() and journal.read_bytes().count(b"\n") >= steps
+
+
+def _run(arguments: Sequence[str], moment: Moment | None) -> tuple[int | None, str, str, float]:
+    """``dualcal run``, killed at a moment: its exit code (None if it was), its outputs, how long it ran."""
     with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
         command = [sys.executable, "-u", "-c", "from tools.cli import main; main()", "run", *arguments]
         begun = perf_counter()
         with subprocess.Popen(command, stdout=output, stderr=errors) as process:
-            try:
-                code: int | None = process.wait(moment)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-                code = None
+            code = process.wait() if moment is None else _killed_at(moment, process)
         seconds = perf_counter() - begun
         output.seek(0)
         errors.seek(0)
         return code, output.read(), errors.read(), seconds
+
+
+def _killed_at(moment: Moment, process: subprocess.Popen[bytes]) -> int | None:
+    """The exit code of one that ended before."""
+    while True:
+        try:
+            return process.wait(0.01)
+        except subprocess.TimeoutExpired:
+            if moment():
+                process.kill()
+                process.wait()
+                return None
 
 
 def _state(folder: Path) -> str:
@@ -154,12 +176,12 @@ def kill_many(cell: Path, overrides: Sequence[str], kills: int, chance: random.R
     while (left := kills - sum(len(trial.kills) for trial in trials)) > 0:
         given = 0
 
-        def moment(left: int = left) -> float | None:
+        def moment(left: int = left) -> Moment | None:
             nonlocal given
             given += 1
             if given > left or (given > 1 and chance.random() >= _AGAIN):
                 return None
-            return chance.uniform(0.0, seconds)
+            return after(chance.uniform(0.0, seconds))
 
         trial = survive(cell, overrides, folder / f"{len(trials)}", whole, moment)
         trials.append(trial)

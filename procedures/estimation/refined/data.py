@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import Array, Mask
+from procedures.estimation.refined.arms import Arm
 
 Indices = NDArray[np.intp]
 
@@ -60,17 +60,26 @@ class CaptureArrays:
 
 
 @dataclass(frozen=True)
+class Words:
+    """What messages call the flange that the arrivals are of, and captures."""
+
+    flange: str = "active flange"
+    captures: str = "captures"
+
+
+@dataclass(frozen=True)
 class Knowns:
     """Both arms; T_F_T (4, 4): target on the passive flange; corners (n, 3) in T, m; matrix (3, 3), px, and
     distortion (5,) of the camera.
     """
 
-    active: Chain
-    passive: Chain
+    active: Arm
+    passive: Arm
     T_F_T: Array
     corners: Array
     matrix: Array
     distortion: Array
+    words: Words = Words()
 
 
 @dataclass(frozen=True)

@@ -193,7 +193,7 @@ def _estimate(
     reached = np.unique(every.arrival[usable])
     refuse_few(len(reached))
     candidates = camera_candidates(every, data.order, data.board_poses, False)
-    refuse_one_axis(every.T_A_H[reached], candidates.optical_axes, noise.active)
+    refuse_one_axis(every.T_A_H[reached], candidates.optical_axes, noise.active, knowns.words)
     everybody = np.ones(len(data), dtype=bool)
     further = [
         Start(np.asarray(T_P_A, dtype=float), np.asarray(T_H_E, dtype=float), ~everybody, np.inf, everybody)
@@ -207,11 +207,12 @@ def _estimate(
         solutions = _best_first(solutions)
     if not solutions:
         raise Degenerate(
-            "no cell explains the captures, even roughly: see that arms, camera and target are the right ones"
+            f"nothing explains the {knowns.words.captures}, even roughly:"
+            " see that arms, camera and target are the right ones"
         )
     best = solutions[0]
     axes = best.model.arrival_poses(best.fit.state)[0][:, :3, 2]
-    warnings = refuse_one_axis(best.model.T_A_H, axes, noise.active)
+    warnings = refuse_one_axis(best.model.T_A_H, axes, noise.active, knowns.words)
     return _result(search, best, _alternatives(best, solutions[1:]), warnings, observable)
 
 
@@ -476,6 +477,6 @@ def _dropped(search: _Search, best: _Solution) -> tuple[Dropped, ...]:
         elif together.sum() > 1 and not best.used[together].any():
             reason = "all captures of its arrival are off: the active arm stood elsewhere than it was read"
         else:
-            reason = f"{sigmas:.0f} sigma (rms) from where the other captures put it"
+            reason = f"{sigmas:.0f} sigma (rms) from where the other {every.knowns.words.captures} put it"
         named.append(Dropped(int(k), reason, sigmas))
     return (*unseen, *named)

@@ -6,6 +6,7 @@ import numpy as np
 
 from dualcal_hal.transforms import Array
 from procedures.estimation.degenerate import Degenerate
+from procedures.estimation.refined.data import Words
 
 # How far, rms, that axis wanders between the arrivals about which the flanges turn most nearly. Flanges turned about
 # one axis or not at all come to 6e-4 with 0.3 mrad of noise; with 5 degrees about a second axis to 0.039 at least.
@@ -24,30 +25,31 @@ def refuse_few(arrivals: int) -> None:
         raise Degenerate(f"{count} of the active arm with captures that can be used, at least 3 are needed")
 
 
-def refuse_one_axis(T_A_H: Array, optical_axes: Array, joint: float) -> tuple[str, ...]:
+def refuse_one_axis(T_A_H: Array, optical_axes: Array, joint: float, words: Words) -> tuple[str, ...]:
     """Raises Degenerate unless the flanges of the arrivals (a, 4, 4) turn about two axes; warnings if they hardly do.
 
     optical_axes (b, 3): directions in P, as far as known; joint: sigma of the active arm's, rad.
     """
+    flange = words.flange
     refuse_few(len(T_A_H))
     limit = max(ONE_AXIS, NOISE * joint)
     off = T_A_H[:, :3, :3] - T_A_H[:, :3, :3].mean(axis=0)
     values = np.linalg.eigvalsh(np.einsum("kia,kib->ab", off, off) / len(off))
     wander = np.sqrt(np.maximum(values, 0.0))
     if wander[2] < limit:
-        raise Degenerate("the active flange has the same orientation at all arrivals: it was only shifted")
+        raise Degenerate(f"the {flange} always has the same orientation: it was only shifted")
     if wander[0] < limit:
         if _orientations(T_A_H[:, :3, :3], limit) < 3:
-            raise Degenerate("the active flange has only two orientations, at least 3 are needed")
+            raise Degenerate(f"the {flange} has only two orientations, at least 3 are needed")
         apart = optical_axes - np.median(optical_axes, axis=0)
         if len(apart) > 1 and np.median(np.linalg.norm(apart, axis=1)) < PARALLEL:
             raise Degenerate("the optical axes of all arrivals are parallel")
-        raise Degenerate("the active flange was turned about one axis only")
+        raise Degenerate(f"the {flange} was turned about one axis only")
     if wander[0] < WEAK:
         degrees = np.degrees(2 * wander[0])
         return (
-            f"weak: the active flange turns by about {degrees:.0f} deg about a second axis; "
-            "captures with at least 30 deg about two axes would help",
+            f"weak: the {flange} turns by about {degrees:.0f} deg about a second axis; "
+            f"{words.captures} with at least 30 deg about two axes would help",
         )
     return ()
 

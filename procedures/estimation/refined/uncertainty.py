@@ -10,13 +10,8 @@ from scipy import stats
 
 from dualcal_hal.transforms import Array, apply, inverse, skew
 
-NAMES = tuple(
-    f"{what} {axis} of {frame}"
-    for frame in ("active_base", "camera")
-    for what in ("translation along", "rotation about")
-    for axis in "xyz"
-)
-"""Of the twelve directions, each in the child frame of its transform."""
+FRAMES = ("active_base", "camera")
+"""Children of the two transforms, in whose axes the twelve directions are."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +36,15 @@ class Direction:
     observable: bool
 
 
-def directions(covariance: Array, limits: Limits) -> tuple[Direction, ...]:
-    """Of the covariance (12, 12) of T_P_A, then T_H_E."""
+def directions(covariance: Array, limits: Limits, frames: tuple[str, str] = FRAMES) -> tuple[Direction, ...]:
+    """Of the covariance (12, 12) of two transforms, by default T_P_A, then T_H_E; frames: their children."""
+    names = (
+        f"{what} {axis} of {f}" for f in frames for what in ("translation along", "rotation about") for axis in "xyz"
+    )
     sigmas = np.sqrt(np.diag(covariance))
     return tuple(
         Direction(name, float(sigma), bool(sigma < limit))
-        for name, sigma, limit in zip(NAMES, sigmas, limits.sigmas, strict=True)
+        for name, sigma, limit in zip(names, sigmas, limits.sigmas, strict=True)
     )
 
 

@@ -8,7 +8,7 @@ arm's place, the flange that of its base.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -17,13 +17,12 @@ from numpy.typing import ArrayLike
 from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import Array, Mask, apply, inverse
 from procedures.estimation.degenerate import Degenerate
-from procedures.estimation.projection import project, undistort
 from procedures.estimation.refined.arms import Arm, Inverted, MeasuredFlange, NoArm
 from procedures.estimation.refined.data import CaptureArrays, Knowns, Noise, Words
 from procedures.estimation.refined.estimate import Dropped, Refined, refined
 from procedures.estimation.refined.fit import minimise
 from procedures.estimation.refined.geometry import refuse_one_axis
-from procedures.estimation.refined.inexact import Inexact, Known, fit_inexact
+from procedures.estimation.refined.inexact import Inexact, Known
 from procedures.estimation.refined.model import CELL, Model
 from procedures.estimation.refined.motion import adjoint
 from procedures.estimation.refined.noise import FoundNoise
@@ -116,6 +115,11 @@ class Views:
     def __len__(self) -> int:
         return len(self.pixels)
 
+    @property
+    def seen(self) -> Mask:
+        """(k, n): which corners were seen."""
+        return np.asarray(np.isfinite(self.pixels).all(axis=-1))
+
 
 @dataclass(frozen=True)
 class OtherSolution:
@@ -142,6 +146,10 @@ class OneArm:
     views say of both, if that was asked for. matrix, distortion: reckoned with, after the estimate where they were
     freed; known: inexact knowns after it. contributions: to the covariance (12, 12), of ``pixels``, ``arm`` and each
     inexact known.
+
+    as_read: whether camera and target fit the corners best with the arm exactly where it was read (``fit_as_read``);
+    cost, scale and distances stay those of the fit with the arm's errors. notes: what there is to be warned of besides
+    large sigmas.
     """
 
     placement: Placement
@@ -160,7 +168,7 @@ class OneArm:
     flipped: Mask
     dropped: tuple[Dropped, ...]
     alternatives: tuple[OtherSolution, ...]
-    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
     pixel_sigma: float
     arm_sigma: float
     found: FoundNoise | None
@@ -168,6 +176,12 @@ class OneArm:
     distortion: Array
     known: tuple[Known, ...]
     contributions: dict[str, Array]
+    as_read: bool = False
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """In words: what is uncertain, then the notes."""
+        return (*_uncertain(self.directions), *self.notes)
 
     @property
     def transforms(self) -> dict[str, Array]:
@@ -209,8 +223,8 @@ def one_arm(
     has is called ``active``, and the target's mount is sought anyway), estimated with it as their prior or only
     reckoned with. Raises Degenerate for views that do not determine both transforms.
     """
-    data, knowns = _as_captures(views, placement)
-    enough = np.isfinite(views.pixels).all(axis=2).sum(axis=1) >= FEWEST_CORNERS
+    data, knowns = as_captures(views, placement)
+    enough = views.seen.sum(axis=1) >= FEWEST_CORNERS
     if enough.sum() < FEWEST_VIEWS:
         count = f"{enough.sum()} view{'s' if enough.sum() != 1 else ''}"
         raise Degenerate(f"{count} with at least {FEWEST_CORNERS} corners seen, at least {FEWEST_VIEWS} are needed")
@@ -229,7 +243,8 @@ def one_arm(
     return _one_arm(data, placement, result, observable or Limits())
 
 
-def _as_captures(views: Views, placement: Placement) -> tuple[CaptureArrays, Knowns]:
+def as_captures(views: Views, placement: Placement) -> tuple[CaptureArrays, Knowns]:
+    """Views as captures that have an arrival each, of a passive arm that is none."""
     k = len(views)
     data = CaptureArrays(
         active=views.arm.values,
@@ -255,10 +270,10 @@ def _one_arm(data: CaptureArrays, placement: Placement, result: Refined, observa
     turned = data.turned(result.flipped)
     model = Model(turned, result.knowns, result.noise)
     residuals = model.residuals(model.state(result.T_P_A, result.T_H_E)) * result.noise.pixel
-    to_camera_and_target = _to_camera_and_target(result.T_P_A)
+    M = camera_and_target(result.T_P_A)
 
     def seen_so(covariance: Array) -> Array:
-        return np.asarray(to_camera_and_target @ covariance @ to_camera_and_target.T)
+        return np.asarray(M @ covariance @ M.T)
 
     covariance = seen_so(result.covariance)
     found = directions(covariance, observable, ("camera", "target"))
@@ -281,7 +296,7 @@ def _one_arm(data: CaptureArrays, placement: Placement, result: Refined, observa
         flipped=result.flipped,
         dropped=result.dropped,
         alternatives=tuple(OtherSolution(a.T_H_E, inverse(a.T_P_A), a.ratio) for a in result.alternatives),
-        warnings=tuple(_warnings(data, result, found)),
+        notes=tuple(_notes(data, result)),
         pixel_sigma=result.noise.pixel,
         arm_sigma=result.noise.active,
         found=result.found,
@@ -292,7 +307,7 @@ def _one_arm(data: CaptureArrays, placement: Placement, result: Refined, observa
     )
 
 
-def _to_camera_and_target(T_P_A: Array) -> Array:
+def camera_and_target(T_P_A: Array) -> Array:
     """(12, 12): errors of T_P_A and T_H_E to those of the camera, which is T_H_E, and of the target, T_P_A's inverse.
 
     log((T_est^-1)^-1 T_true^-1) = -Ad(T_est) log(T_est^-1 T_true).
@@ -303,20 +318,13 @@ def _to_camera_and_target(T_P_A: Array) -> Array:
     return M
 
 
-def _warnings(data: CaptureArrays, result: Refined, found: Sequence[Direction]) -> Iterator[str]:
+def _notes(data: CaptureArrays, result: Refined) -> Iterator[str]:
     model = Model(data.turned(result.flipped).only(result.used), result.knowns, result.noise)
     fit = minimise(model, model.state(result.T_P_A, result.T_H_E))
     if not fit.converged:
         yield "the estimate has not converged"
     axes = model.arrival_poses(fit.state)[0][:, :3, 2]
     yield from refuse_one_axis(model.T_A_H, axes, result.noise.active, result.knowns.words)
-    large = [d for d in found if d.name.startswith("translation") and d.sigma > _LARGE]
-    if large:
-        names = ", ".join(f"{d.name} by {1e3 * d.sigma:.1f} mm" for d in large)
-        yield f"uncertain (1 sigma): {names}; views with the flange turned further would help"
-    hidden = [d.name for d in found if not d.observable and d not in large]
-    if hidden:
-        yield f"not observable: {', '.join(hidden)}"
     for other in result.alternatives:
         yield f"a second solution costs only {other.ratio:.2f} times as much"
     unseen = [known.name for known in result.known if not known.seen]
@@ -324,57 +332,11 @@ def _warnings(data: CaptureArrays, result: Refined, found: Sequence[Direction]) 
         yield f"cannot be seen in the views: {', '.join(unseen)}"
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """Each view predicted by an estimate without it: pixels (k, n, 2), px, predicted minus seen; at_target (k, n), m:
-    from a predicted corner straight to the line of sight of the one that was seen. NaN for corners not seen.
-    """
-
-    pixels: Array
-    at_target: Array
-
-    def rms(self) -> tuple[Array, Array]:
-        """(k,) px per axis and (k,) m, of each view; NaN for a view without a corner."""
-        with np.errstate(invalid="ignore"):
-            seen = np.isfinite(self.at_target)
-            count = np.where(seen.any(axis=1), seen.sum(axis=1), np.nan)
-            pixels = np.sqrt(np.nansum(self.pixels**2, axis=(1, 2)) / (2 * count))
-            return pixels, np.sqrt(np.nansum(self.at_target**2, axis=1) / count)
-
-
-def leave_one_out(views: Views, result: OneArm, inexact: Sequence[Inexact] = ()) -> LeftOut:
-    """From the result of :func:`one_arm`, with the same ``inexact`` if they were estimated.
-
-    Takes one fit a view: a time that grows with the square of their number.
-    """
-    data, knowns = _as_captures(views, result.placement)
-    data = data.turned(result.flipped)
-    there = replace(knowns, matrix=result.matrix, distortion=result.distortion)
-    noise = Noise(result.pixel_sigma, result.arm_sigma, result.arm_sigma)
-    pixels, at_target = np.full(data.pixels.shape, np.nan), np.full(data.pixels.shape[:2], np.nan)
-    for view in np.flatnonzero(np.isfinite(data.pixels).all(axis=2).any(axis=1)):
-        used = result.used.copy()
-        used[view] = False
-        alone = np.arange(len(data)) == view
-        others = Model(data.only(used), there, noise)
-        state = others.state(inverse(result.target), result.camera)
-        if inexact:
-            fitted = fit_inexact(data.only(used), knowns, noise, state, inexact, True)
-            state, without = fitted.fit.state, fitted.knowns
-        else:
-            state, without = minimise(others, state).state, there
-        pixels[view], at_target[view] = _predicted(data.only(alone), without, state.T_P_A, state.T_H_E)
-    return LeftOut(pixels, at_target)
-
-
-def _predicted(view: CaptureArrays, knowns: Knowns, T_P_A: Array, T_H_E: Array) -> tuple[Array, Array]:
-    """Of one view (n, 2), px, and (n,), m."""
-    T_E_T = inverse(T_P_A @ knowns.active.forward(view.active[0]) @ T_H_E)
-    points, seen = apply(T_E_T, knowns.corners), view.pixels[0]
-    off = project(points, knowns.matrix, knowns.distortion) - seen
-    there = np.isfinite(seen).all(axis=1)
-    sight = np.ones((len(points), 3))
-    sight[:, :2] = undistort(np.where(there[:, None], seen, knowns.matrix[:2, 2]), knowns.matrix, knowns.distortion)
-    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-    across = np.linalg.norm(np.cross(points, sight), axis=1)
-    return off, np.where(there, across, np.nan)
+def _uncertain(found: Sequence[Direction]) -> Iterator[str]:
+    large = [d for d in found if d.name.startswith("translation") and d.sigma > _LARGE]
+    if large:
+        names = ", ".join(f"{d.name} by {1e3 * d.sigma:.1f} mm" for d in large)
+        yield f"uncertain (1 sigma): {names}; views with the flange turned further would help"
+    hidden = [d.name for d in found if not d.observable and d not in large]
+    if hidden:
+        yield f"not observable: {', '.join(hidden)}"

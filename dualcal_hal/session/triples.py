@@ -75,7 +75,9 @@ class PoseTriples:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pose:
+class Pose:
+    """T (4, 4), m; covariance (6, 6) where it is known."""
+
     T: Array
     covariance: Array | None
 
@@ -84,7 +86,7 @@ class _Pose:
 class _Triple:
     name: str
     where: str
-    poses: Mapping[str, _Pose]
+    poses: Mapping[str, Pose]
 
 
 def read_triples(path: Path) -> PoseTriples:
@@ -135,7 +137,7 @@ def _from_json(path: Path) -> tuple[list[_Triple], list[Problem]]:
     if not isinstance(raw, list):
         raise FormatError([Problem(str(path), "triples: must be a list")])
     _require_count(path, len(raw))
-    lines = _lines_of_triples(path.read_bytes())
+    lines = lines_of_entries(path.read_bytes(), "triples")
     triples: list[_Triple] = []
     problems: list[Problem] = []
     for index, record in enumerate(raw):
@@ -161,19 +163,20 @@ def _name(record: Any, otherwise: str) -> str:
     return str(name)
 
 
-def _poses(record: Mapping[str, Any]) -> tuple[dict[str, _Pose], list[str]]:
+def _poses(record: Mapping[str, Any]) -> tuple[dict[str, Pose], list[str]]:
     poses, wrong = {}, []
     for key in _POSES:
         try:
             if not isinstance(record.get(key), dict):
                 raise ValueError("is missing" if key not in record else "is not a JSON object")
-            poses[key] = _pose(record[key])
+            poses[key] = pose_of(record[key])
         except ValueError as error:
             wrong.append(f"{key}: {error}")
     return poses, wrong
 
 
-def _pose(entry: Mapping[str, Any]) -> _Pose:
+def pose_of(entry: Mapping[str, Any]) -> Pose:
+    """A POSE as the file has it; ValueError for what is none."""
     rotations = [key for key in ("matrix", "quaternion_xyzw", "rotation_vector_rad") if key in entry]
     if len(rotations) != 1:
         raise ValueError("needs one of matrix, quaternion_xyzw and rotation_vector_rad")
@@ -188,8 +191,8 @@ def _pose(entry: Mapping[str, Any]) -> _Pose:
         count = 4 if rotations == ["quaternion_xyzw"] else 3
         T = _from_parts(translation, finites(entry[rotations[0]], rotations[0], count))
     if entry.get("covariance") is None:
-        return _Pose(T, None)
-    return _Pose(T, _covariance(_table(entry["covariance"], "covariance", 6)))
+        return Pose(T, None)
+    return Pose(T, _covariance(_table(entry["covariance"], "covariance", 6)))
 
 
 def _table(value: Any, name: str, size: int) -> Array:
@@ -239,15 +242,15 @@ def _covariance(covariance: Array) -> Array:
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def _lines_of_triples(data: bytes) -> list[int]:
-    """The line, from 1, on which each entry of ``triples`` begins, in a JSON text that is known to be an object."""
+def lines_of_entries(data: bytes, name: str) -> list[int]:
+    """The line, from 1, on which each entry of the list ``name`` begins, in a text that is known to be an object."""
     text = data.decode(json.detect_encoding(data))
     decoder = json.JSONDecoder()
     at = _next(text, 0) + 1
     while text[at := _next(text, at)] != "}":
         key, at = decoder.raw_decode(text, at)
         at = _next(text, at)
-        if key == "triples":
+        if key == name:
             return list(_lines_of_items(text, at, decoder))
         at = decoder.raw_decode(text, at)[1]
     return []
@@ -341,15 +344,15 @@ class _Columns:
         return _Triple(values.get("id", "").strip() or otherwise, where, poses), []
 
 
-def _pose_in_row(values: Mapping[str, str], key: str, form: Sequence[str]) -> _Pose:
+def _pose_in_row(values: Mapping[str, str], key: str, form: Sequence[str]) -> Pose:
     numbers = [_number(values[f"{key}_{name}"], f"{key}_{name}") for name in form]
     T = _from_matrix(np.reshape(numbers, (3, 4))) if form == _MATRIX else _from_parts(numbers[:3], numbers[3:])
     if f"{key}_{_SIGMAS[0]}" not in values:
-        return _Pose(T, None)
+        return Pose(T, None)
     sigmas = [_number(values[f"{key}_{name}"], f"{key}_{name}") for name in _SIGMAS]
     if min(sigmas) < 0:
         raise ValueError("a sigma is negative")
-    return _Pose(T, np.diag(np.repeat(np.square(sigmas), 3)))
+    return Pose(T, np.diag(np.repeat(np.square(sigmas), 3)))
 
 
 def _number(text: str, name: str) -> float:

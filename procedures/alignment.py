@@ -16,7 +16,7 @@ import numpy as np
 from dualcal_hal.errors import UsageError
 from dualcal_hal.robot import Joints
 from dualcal_hal.transforms import Array, inverse, rotation_angle, transform
-from procedures.analysis import FARTHEST_ALIGNED
+from procedures.analysis.paper import FARTHEST_ALIGNED
 from procedures.detection import Detection, Detector, Miss, Missed, board_poses
 from procedures.estimation.projection import undistort
 from procedures.going import go

@@ -24,7 +24,7 @@ from procedures.alignment import (
     target_on_axis,
     tolerance_px,
 )
-from procedures.analysis import FARTHEST_ALIGNED
+from procedures.analysis.paper import FARTHEST_ALIGNED
 from procedures.calibrate import requests_of
 from procedures.detection import Detector
 from procedures.planning.belief import Belief

@@ -402,7 +402,7 @@ BAD = {
         "tilt_max_deg: 45", "tilt_max_deg: 90", "90\n  tol", "procedure.tilt_max_deg: must be less than 90, not 90",
     ),
     "an unknown method": (
-        "method: paper", "method: papr", "papr", "procedure.method: unknown method 'papr'; there are: paper",
+        "method: paper", "method: papr", "papr", "procedure.method: unknown method 'papr'; there are: refined, paper",
     ),
     "a tolerance that is neither a number nor auto": (
         "tolerance_px: 0.1", "tolerance_px: tight", "tight",

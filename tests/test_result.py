@@ -124,7 +124,7 @@ class TestAnalysis:
             analyse(changed(captures, "calibration", feature=(100.0, 100.0)), cell, "paper")
 
     def test_an_unknown_method_is_refused_with_those_there_are(self, captures: Captures, cell: CellConfig) -> None:
-        with pytest.raises(UsageError, match="unknown method 'magic'; there are: paper"):
+        with pytest.raises(UsageError, match="unknown method 'magic'; there are: refined, paper"):
             analyse(captures, cell, "magic")
 
 

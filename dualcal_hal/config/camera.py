@@ -18,6 +18,17 @@ def _camera_matrix(matrix: Matrix3) -> Matrix3:
     return matrix
 
 
+class IntrinsicsSigma(Section):
+    """How exact the camera's intrinsics are, 1 sigma each."""
+
+    focal_px: NotNegative = 0.0
+    """Of fx and of fy, px."""
+    centre_px: NotNegative = 0.0
+    """Of cx and of cy, px."""
+    distortion: tuple[NotNegative, NotNegative, NotNegative, NotNegative, NotNegative] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """Of k1, k2, p1, p2, k3."""
+
+
 class CameraBody(Section):
     """A capsule about the camera's optical axis, for clearance."""
 
@@ -38,6 +49,8 @@ class CameraConfig(Section):
     """[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], px; pixel centres are integers."""
     distortion: tuple[Number, Number, Number, Number, Number]
     """OpenCV's k1, k2, p1, p2, k3."""
+    intrinsics_sigma: IntrinsicsSigma | None = None
+    """How exact matrix and distortion are; exact where left out."""
     size_px: tuple[AtLeast1, AtLeast1]
     """Width and height, px."""
     sigma_px: NotNegative

@@ -121,6 +121,11 @@ def _simulated_only_problems(document: Mapping[str, Any], used: list[Any]) -> It
         yield ("nominal", "uncertainty"), "missing key; only a cell that is simulated goes without"
     if _mapping(document.get("procedure")).get("first_looks") == 0:
         yield ("procedure", "first_looks"), "must be at least 3; only a cell that is simulated goes without looks"
+    procedure = _mapping(document.get("procedure"))
+    verification = _mapping(procedure.get("verification"))
+    if procedure.get("method") == "refined" and verification.get("required_accuracy_mm") is None:
+        location = ("procedure", "verification", "required_accuracy_mm")
+        yield location, "missing key; only a cell that is simulated goes without"
 
 
 def _is_simulated(type_: Any) -> bool:

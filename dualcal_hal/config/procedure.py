@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
 from dualcal_hal.config.values import (
     AtLeast1,
@@ -17,27 +17,68 @@ from dualcal_hal.config.values import (
     Range,
     Section,
     Tolerance,
+    Vector,
 )
 from dualcal_hal.transforms import Array
 
-METHODS = ("paper",)
+METHODS = ("refined", "paper")
 """The estimators a cell file may name."""
+
+FEWEST_FOR_PAPER = 3
+"""Positions of a constraint that the paper's line fit needs."""
+
+
+class RegionConfig(Section):
+    """A box in the passive base."""
+
+    low_mm: Vector
+    """Its lowest corner, mm."""
+    high_mm: Vector
+    """Its highest corner, mm."""
+
+    @field_validator("high_mm")
+    @classmethod
+    def _is_above(cls, value: tuple[float, float, float], info: ValidationInfo) -> tuple[float, float, float]:
+        for axis, low, high in zip("xyz", info.data.get("low_mm", value), value, strict=True):
+            if high < low:
+                raise ValueError(f"{axis}: {high:g} is below low_mm, {low:g}")
+        return value
+
+    @property
+    def corners(self) -> Array:
+        """(2, 3) m: lowest and highest."""
+        return np.array([self.low_mm, self.high_mm]) / 1000
 
 
 class VerificationConfig(Section):
     """The poses that prove the result; the estimate does not use them."""
 
-    constraints: Natural
-    """How many directions of the optical axis; 0 leaves the result unverified."""
-    positions: AtLeast1
+    constraints: Natural = 6
+    """How many directions of the optical axis; 0 leaves the result unverified. An arrival of the active arm is worth
+    about one independent look, however many positions it has."""
+    positions: AtLeast1 = 2
     """How many positions of the feature point on each axis."""
-    limit_mm: Positive
-    """Largest mean mismatch that passes, mm."""
+    limit_mm: Positive = 0.5
+    """Method paper: the largest mean mismatch that passes, mm."""
+    required_accuracy_mm: Positive | None = None
+    """Method refined: what the predicted 3D error (95 %) may be all over the region, mm; 1 where left out, which only
+    a cell that is simulated may."""
+    region: RegionConfig | None = None
+    """Method refined: where the accuracy is required; the box of the verification points where left out."""
 
     @property
     def limit(self) -> float:
         """Metres."""
         return self.limit_mm / 1000
+
+    @property
+    def required_accuracy(self) -> float:
+        """Metres."""
+        return (self.required_accuracy_mm or DEFAULT_ACCURACY_MM) / 1000
+
+
+DEFAULT_ACCURACY_MM = 1.0
+"""What is required of a simulated cell that does not say."""
 
 
 def _known_method(value: str) -> str:
@@ -82,12 +123,13 @@ class ProcedureConfig(Section):
 
     seed: Natural
     """Of the choice of poses."""
-    method: Annotated[str, AfterValidator(_known_method), Field(json_schema_extra={"enum": list(METHODS)})]
-    """The estimator."""
+    method: Annotated[str, AfterValidator(_known_method), Field(json_schema_extra={"enum": list(METHODS)})] = "paper"
+    """The estimator: refined uses all corners and says what the result is worth; paper is the two steps of the paper,
+    and what a file means that names none."""
     constraints: AtLeast3
     """How many directions of the optical axis."""
-    positions: AtLeast3
-    """How many positions of the feature point on each axis."""
+    positions: AtLeast1
+    """How many positions of the feature point on each axis; method paper needs 3."""
     first_looks: Annotated[Natural, AfterValidator(_none_or_three)] = 5
     """How many images to plan from, at least 3; 0 plans from the nominal transforms, on simulated cells only."""
     stand_off: StandOffConfig | None = None
@@ -100,8 +142,18 @@ class ProcedureConfig(Section):
     """Largest offset of an aligned feature point in each axis, px; auto follows the scatter of arrivals."""
     clearance_mm: NotNegative = 20.0
     """Smallest distance kept between arms, camera, target and floor, mm."""
-    verification: VerificationConfig
+    knowns: Literal["estimate", "propagate"] = "estimate"
+    """Method refined: what knowns that carry a sigma are: estimated with it as what is known of them, or left as they
+    are and only reckoned with in the result's uncertainty."""
+    verification: VerificationConfig = VerificationConfig()
     """The proof."""
+
+    @field_validator("positions")
+    @classmethod
+    def _enough_for_a_line(cls, value: int, info: ValidationInfo) -> int:
+        if info.data.get("method") == "paper" and value < FEWEST_FOR_PAPER:
+            raise ValueError(f"must be at least {FEWEST_FOR_PAPER} for method paper, which fits a line, not {value}")
+        return value
 
     @property
     def distance(self) -> tuple[float, float]:

@@ -50,11 +50,41 @@ class DhRow(Section):
         return Row(theta, (self.d_mm or 0.0) / 1000, self.a_mm / 1000, alpha, beta)
 
 
+class RowSigma(Section):
+    """How exact the rows of an arm's kinematics are: 1 sigma of each parameter."""
+
+    length_mm: NotNegative = 0.0
+    """Of each a and d, mm."""
+    angle_deg: NotNegative = 0.0
+    """Of each alpha and beta, degrees."""
+
+
+class TransformSigma(Section):
+    """How exact a transform is: 1 sigma in each axis."""
+
+    translation_mm: NotNegative = 0.0
+    """Of the translation along each axis, mm."""
+    rotation_deg: NotNegative = 0.0
+    """Of the rotation about each axis, degrees."""
+
+
 class KinematicsConfig(Section):
     """An arm's calibrated kinematics."""
 
     dh: Annotated[tuple[DhRow, ...], Field(min_length=1)]
     """One row a joint, from base to flange."""
+    joint_zero_sigma_deg: tuple[NotNegative, ...] | None = None
+    """How exact the zero of each joint is, 1 sigma, degrees; exact where left out."""
+    dh_sigma: RowSigma | None = None
+    """How exact the other parameters of all rows are; exact where left out."""
+
+    @field_validator("joint_zero_sigma_deg")
+    @classmethod
+    def _one_entry_a_joint(cls, value: tuple[float, ...] | None, info: ValidationInfo) -> Any:
+        rows = info.data.get("dh")
+        if value is not None and rows is not None and len(value) != len(rows):
+            raise ValueError(f"must have {len(rows)} entries, one a joint, has {len(value)}")
+        return value
 
     @cached_property
     def chain(self) -> Chain:
@@ -90,6 +120,8 @@ class RobotConfig(Section):
     """Radius of the capsule about each link, mm; where left out 55 for the first three and 45 for the wrist's."""
     target_mount: TransformConfig | None = Field(default=None, validate_default=True)
     """Target in the passive flange; the passive arm's alone."""
+    target_mount_sigma: TransformSigma | None = None
+    """How exact target_mount is; exact where left out."""
 
     @field_validator(
         "limits_deg", "limit_margin_deg", "speed_deg_s", "acceleration_deg_s2", "home_deg", "link_radius_mm"
@@ -125,6 +157,13 @@ class RobotConfig(Section):
         if role == "passive" and value is None:
             raise ValueError("missing key: the passive arm carries the target")
         if role == "active" and value is not None:
+            raise ValueError("must be left out: the active arm carries the camera")
+        return value
+
+    @field_validator("target_mount_sigma")
+    @classmethod
+    def _of_a_mount(cls, value: TransformSigma | None, info: ValidationInfo) -> Any:
+        if value is not None and info.data.get("role") == "active":
             raise ValueError("must be left out: the active arm carries the camera")
         return value
 

@@ -49,6 +49,8 @@ class TargetConfig(Section):
     """Rows and columns of inner corners, at least 3 each: with fewer no detector works."""
     square_mm: Positive
     """Side of a square, mm."""
+    square_sigma_mm: NotNegative = 0.0
+    """How exact square_mm is, 1 sigma, common to all squares, mm."""
     feature_corner: tuple[Natural, Natural] | None = Field(default=None, validate_default=True)
     """Row and column of the feature point, from 0; the middlemost corner where left out and there is one."""
     margin_mm: NotNegative = 10.0

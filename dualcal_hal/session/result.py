@@ -13,6 +13,7 @@ from typing import Any, Literal, cast, get_args
 import numpy as np
 
 from dualcal_hal.errors import FormatError, Problem
+from dualcal_hal.session.accuracy import Accuracy, Verification
 from dualcal_hal.session.files import read_document, read_object, write_document
 from dualcal_hal.transforms import Array, is_rotation, quaternion_from_rotation, rotation_angle, vector_from_rotation
 
@@ -36,8 +37,8 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class Unobservable:
-    """A direction in which the transform ``of`` keeps its nominal value: unit 6-vector [translation; rotation] in
-    that transform's child frame.
+    """A direction in which the transform ``of`` is not determined, and with method paper keeps its nominal value: unit
+    6-vector [translation; rotation] in that transform's child frame.
     """
 
     what: str
@@ -56,13 +57,16 @@ class Rejected:
 @dataclass(frozen=True)
 class TruthError:
     """Against a known truth: of T_P_A the angle (rad) and the distance (m); of T_H_E the angle between the optical
-    axes (rad) and the position's error across the true axis (m).
+    axes (rad) and the position's error across the true axis (m), and, of a method that finds all of it, the angle and
+    the distance.
     """
 
     base_rotation: float
     base_translation: float
     camera_axis: float
     camera_sideways: float
+    camera_rotation: float | None = None
+    camera_translation: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +75,7 @@ class Result:
 
     T_P_A, T_H_E (4, 4); optical_axis: z_H_E (3,); iterations: JSON records with at least ``rotation_update``;
     mismatch_before and mismatch_after: with the nominal and the found transforms, None without verification;
-    captures_used: ids of the captures estimated from.
+    captures_used: ids of the captures estimated from; accuracy, verification: of the refined method alone.
     """
 
     method: str
@@ -87,10 +91,12 @@ class Result:
     verdict: Verdict
     reasons: tuple[str, ...]
     truth_error: TruthError | None = None
+    accuracy: Accuracy | None = None
+    verification: Verification | None = None
 
     def to_document(self) -> dict[str, Any]:
         """The public document."""
-        return {
+        document = {
             "format": FORMAT,
             "method": self.method,
             "transforms": {T_P_A_NAME: transform_document(self.T_P_A), T_H_E_NAME: transform_document(self.T_H_E)},
@@ -104,6 +110,10 @@ class Result:
             "verdict": self.verdict,
             "reasons": list(self.reasons),
         }
+        for key, part in (("accuracy", self.accuracy), ("verification", self.verification)):
+            if part is not None:
+                document[key] = part.model_dump(mode="json")
+        return document
 
 
 def write_result(path: Path, result: Result) -> None:
@@ -149,11 +159,14 @@ def with_truth_error(result: Result, truth: Mapping[str, Array]) -> Result:
     axis = T_H_E[:3, 2]
     shift = result.T_H_E[:3, 3] - T_H_E[:3, 3]
     sine = np.linalg.norm(np.cross(result.optical_axis, axis))
+    nominal = result.accuracy is None  # the paper's method leaves a part of it as it was given
     error = TruthError(
         base_rotation=float(rotation_angle(result.T_P_A[:3, :3], T_P_A[:3, :3])),
         base_translation=float(np.linalg.norm(result.T_P_A[:3, 3] - T_P_A[:3, 3])),
         camera_axis=float(np.arctan2(sine, result.optical_axis @ axis)),
         camera_sideways=float(np.linalg.norm(shift - (shift @ axis) * axis)),
+        camera_rotation=None if nominal else float(rotation_angle(result.T_H_E[:3, :3], T_H_E[:3, :3])),
+        camera_translation=None if nominal else float(np.linalg.norm(shift)),
     )
     return replace(result, truth_error=error)
 
@@ -193,6 +206,8 @@ def _truth_error(error: TruthError) -> dict[str, Any]:
         T_H_E_NAME: {
             "axis_deg": float(np.degrees(error.camera_axis)),
             "sideways_mm": 1e3 * error.camera_sideways,
+            **({} if error.camera_rotation is None else {"rotation_deg": float(np.degrees(error.camera_rotation))}),
+            **({} if error.camera_translation is None else {"translation_mm": 1e3 * error.camera_translation}),
         },
     }
 
@@ -216,6 +231,8 @@ def _from_document(document: Mapping[str, Any]) -> Result:
         verdict=_verdict(document["verdict"]),
         reasons=tuple(map(_text, document["reasons"])),
         truth_error=None if truth is None else _truth_error_from(truth),
+        accuracy=Accuracy.model_validate(document["accuracy"]) if "accuracy" in document else None,
+        verification=Verification.model_validate(document["verification"]) if "verification" in document else None,
     )
 
 
@@ -261,4 +278,6 @@ def _truth_error_from(truth: Mapping[str, Any]) -> TruthError:
         base_translation=float(base["translation_mm"]) / 1e3,
         camera_axis=float(np.radians(camera["axis_deg"])),
         camera_sideways=float(camera["sideways_mm"]) / 1e3,
+        camera_rotation=float(np.radians(camera["rotation_deg"])) if "rotation_deg" in camera else None,
+        camera_translation=float(camera["translation_mm"]) / 1e3 if "translation_mm" in camera else None,
     )

@@ -15,7 +15,7 @@ from scipy import stats
 
 from dualcal_hal.cellfile import load_cell
 from dualcal_hal.clock import RealClock
-from dualcal_hal.kinematics import random_joints
+from dualcal_hal.kinematics import Chain, random_joints
 from dualcal_hal.session.captures import Use, read_captures
 from dualcal_hal.transforms import Array, Mask, apply, inverse, rotation_from_vector, skew, transform
 from procedures.estimation import Degenerate, mismatch
@@ -247,6 +247,7 @@ def boards(
         facing = transform(camera[:3, :3] @ np.diag([1.0, -1, -1]) @ turned, camera[:3, 3] + depth * camera[:3, 2])
         goals[i, j] = facing @ inverse(knowns.T_F_T)
     goals = goals.reshape(-1, 4, 4).repeat(tries, axis=0)
+    assert isinstance(knowns.passive, Chain)
     passive, reached = knowns.passive.inverse(goals, random_joints(rng, len(goals), lower, upper), lower, upper)
     passive, reached = passive.reshape(-1, positions, tries, 6), reached.reshape(-1, positions, tries)
     chosen = np.take_along_axis(passive, reached.argmax(axis=2)[..., None, None], axis=2)[:, :, 0]

@@ -27,6 +27,13 @@ Method = Annotated[str | None, typer.Option(help="Estimator; overrides procedure
 Json = Annotated[bool, typer.Option("--json", help="Print result.json alone on standard output.")]
 
 
+class Noise(StrEnum):
+    """Where the refined method has its sigmas from."""
+
+    STATED = "stated"
+    ESTIMATE = "estimate"
+
+
 class Procedure(StrEnum):
     """As ``dualcal_hal.session.conduct`` has them."""
 
@@ -118,6 +125,17 @@ def estimate(
     redetect: Annotated[
         bool, typer.Option("--redetect", help="Detect the target anew in the session's recorded images.")
     ] = False,
+    noise: Annotated[
+        Noise | None,
+        typer.Option(help="Refined: the sigmas of corners and joints, as the cell file states them or found. [stated]"),
+    ] = None,
+    keep_all: Annotated[
+        bool, typer.Option("--keep-all", help="Refined: drop no capture, however badly it fits the others.")
+    ] = False,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KNOWN", help="Refined: leave target_mount or intrinsics to the captures; repeatable."),
+    ] = None,
     sigma_a: Annotated[
         str | None, typer.Option(metavar="MM,DEG", help="Triples: sigma per axis of A, the active flange in its base.")
     ] = None,
@@ -139,7 +157,21 @@ def estimate(
         from tools.cli.estimate import EstimateOptions, estimate_captures
 
         sigmas = {"A": sigma_a, "B": sigma_b, "C": sigma_c}
-        estimate_captures(EstimateOptions(captures, cell, method, truth, out, redetect, json, sigmas))
+        estimate_captures(
+            EstimateOptions(
+                captures=captures,
+                cell=cell,
+                method=method,
+                truth=truth,
+                out=out,
+                redetect=redetect,
+                noise=None if noise is None else noise.value,
+                keep_all=keep_all,
+                free=tuple(free or ()),
+                json=json,
+                sigmas=sigmas,
+            )
+        )
 
 
 @app.command()

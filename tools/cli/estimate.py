@@ -15,7 +15,7 @@ from dualcal_hal.session.captures import Captures, CellShape, read_captures
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.result import Rejected, read_truth, with_truth_error, write_result
 from dualcal_hal.transforms import Array
-from procedures.analysis import analyse
+from procedures.analysis import Choices, analyse
 from procedures.calibrate import captures_of, finished
 from procedures.redetection import detect_anew
 from tools.cli.show import show_result
@@ -37,6 +37,9 @@ class EstimateOptions:
     truth: Path | None
     out: Path | None
     redetect: bool
+    noise: str | None
+    keep_all: bool
+    free: tuple[str, ...]
     json: bool
     sigmas: Mapping[str, str | None]  # of pose triples alone, by A, B, C
 
@@ -62,7 +65,7 @@ def estimate_captures(options: EstimateOptions) -> None:
         console.print(
             f"warning: the captures were taken with another cell file than {_cell_path(options)}", style="yellow"
         )
-    result = analyse(captures, file.cell, options.method or file.cell.procedure.method)
+    result = analyse(captures, file.cell, options.method or file.cell.procedure.method, _choices(options))
     if unfinished:
         said = f"{len(unfinished)} captures left out, the first {unfinished[0].id}: {unfinished[0].reason}"
         rejected = (*result.captures_rejected, *unfinished)
@@ -88,12 +91,22 @@ def _refuse_unfit(options: EstimateOptions, *, triples: bool) -> None:
         "--method": options.method is not None,
         "--truth": options.truth is not None,
         "--redetect": options.redetect,
+        "--noise": options.noise is not None,
+        "--keep-all": options.keep_all,
+        "--free": bool(options.free),
     }
     of_triples = {f"--sigma-{name.lower()}": sigma is not None for name, sigma in options.sigmas.items()}
     unfit = ", ".join(name for name, given in (of_captures if triples else of_triples).items() if given)
     if unfit:
         here, there = ("pose triples", "captures") if triples else ("captures", "pose triples")
         raise UsageError(f"{options.captures}: has {here}; leave out what is for {there}: {unfit}")
+
+
+def _choices(options: EstimateOptions) -> Choices | None:
+    """Of the refined method; None where none was made."""
+    if options.noise is None and not options.keep_all and not options.free:
+        return None
+    return Choices(options.noise == "estimate", options.keep_all, options.free)
 
 
 def _cell_path(options: EstimateOptions) -> Path:

@@ -31,12 +31,13 @@ _SINGULAR = 1e-8  # of the scaled information, a square
 
 @dataclass(frozen=True)
 class Inexact:
-    """names and sigmas (m,) of the numbers by which ``shifted`` says knowns are off; scale (m,): of what counts as a
-    small change of each.
+    """names, units (m, rad, px, or "" for a part of one) and sigmas (m,) of the numbers by which ``shifted`` says
+    knowns are off; scale (m,): of what counts as a small change of each.
     """
 
     what: str
     names: tuple[str, ...]
+    units: tuple[str, ...]
     sigmas: Array
     scale: Array
     shifted: Callable[[Knowns, Array], Knowns]
@@ -49,7 +50,8 @@ def target_mount(translation: float, rotation: float) -> Inexact:
         return replace(knowns, T_F_T=moved(knowns.T_F_T, by))
 
     names = tuple(f"target mount, {what} {axis}" for what in ("along", "about") for axis in "xyz")
-    return Inexact("target mount", names, np.repeat([translation, rotation], 3), np.ones(6), shifted)
+    sigmas = np.repeat([translation, rotation], 3)
+    return _without_exact("target mount", names, ("m",) * 3 + ("rad",) * 3, sigmas, np.ones(6), shifted)
 
 
 def square_size(relative: float) -> Inexact:
@@ -58,7 +60,7 @@ def square_size(relative: float) -> Inexact:
     def shifted(knowns: Knowns, by: Array) -> Knowns:
         return replace(knowns, corners=knowns.corners * (1 + by[0]))
 
-    return Inexact("square size", ("square size",), np.array([relative]), np.ones(1), shifted)
+    return Inexact("square size", ("square size",), ("",), np.array([relative]), np.ones(1), shifted)
 
 
 def intrinsics(focal: float, centre: float, distortion: Sequence[float]) -> Inexact:
@@ -71,7 +73,8 @@ def intrinsics(focal: float, centre: float, distortion: Sequence[float]) -> Inex
 
     sigmas = np.array([focal, focal, centre, centre, *distortion], dtype=float)
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-    return _without_exact("intrinsics", names, sigmas, np.array([1e3] * 4 + [1.0] * 5), shifted)
+    units = ("px",) * 4 + ("",) * 5
+    return _without_exact("intrinsics", names, units, sigmas, np.array([1e3] * 4 + [1.0] * 5), shifted)
 
 
 def joint_zeros(arm: str, sigmas: Sequence[float]) -> Inexact:
@@ -84,7 +87,9 @@ def joint_zeros(arm: str, sigmas: Sequence[float]) -> Inexact:
 
     names = tuple(f"zero of joint {i + 1} of the {arm} arm" for i in range(len(sigmas)))
     values = np.asarray(sigmas, dtype=float)
-    return _without_exact(f"joint zeros of the {arm} arm", names, values, np.ones(len(values)), shifted)
+    return _without_exact(
+        f"joint zeros of the {arm} arm", names, ("rad",) * len(values), values, np.ones(len(values)), shifted
+    )
 
 
 def link_parameters(arm: str, joints: int, length: float, angle: float) -> Inexact:
@@ -99,7 +104,8 @@ def link_parameters(arm: str, joints: int, length: float, angle: float) -> Inexa
 
     names = tuple(f"{what} of row {i + 1} of the {arm} arm" for i in range(joints) for what in ("d", "a", "alpha"))
     sigmas = np.tile([length, length, angle], joints)
-    return _without_exact(f"links of the {arm} arm", names, sigmas, np.ones(3 * joints), shifted)
+    units = ("m", "m", "rad") * joints
+    return _without_exact(f"links of the {arm} arm", names, units, sigmas, np.ones(3 * joints), shifted)
 
 
 def _with_arm(knowns: Knowns, arm: str, rows: tuple[Row, ...]) -> Knowns:
@@ -107,7 +113,12 @@ def _with_arm(knowns: Knowns, arm: str, rows: tuple[Row, ...]) -> Knowns:
 
 
 def _without_exact(
-    what: str, names: tuple[str, ...], sigmas: Array, scale: Array, shifted: Callable[[Knowns, Array], Knowns]
+    what: str,
+    names: tuple[str, ...],
+    units: tuple[str, ...],
+    sigmas: Array,
+    scale: Array,
+    shifted: Callable[[Knowns, Array], Knowns],
 ) -> Inexact:
     """Numbers with a sigma of zero stay where they are."""
     moving = sigmas > 0
@@ -117,17 +128,19 @@ def _without_exact(
         every[moving] = by
         return shifted(knowns, every)
 
-    kept = tuple(name for name, moves in zip(names, moving, strict=True) if moves)
-    return Inexact(what, kept, sigmas[moving], scale[moving], of_all)
+    kept = [both for both, moves in zip(zip(names, units, strict=True), moving, strict=True) if moves]
+    of_kept, unit_of_kept = zip(*kept, strict=True)
+    return Inexact(what, of_kept, unit_of_kept, sigmas[moving], scale[moving], of_all)
 
 
 @dataclass(frozen=True)
 class Known:
-    """One number after the estimate: by how much the knowns were off (m, rad, px or a part), its sigma before and
-    after, and whether the captures see it at all.
+    """One number after the estimate: by how much the knowns were off, in ``unit`` ("" for a part of one), its sigma
+    before and after, and whether the captures see it at all.
     """
 
     name: str
+    unit: str
     value: float
     prior: float
     sigma: float
@@ -136,8 +149,8 @@ class Known:
 
 @dataclass(frozen=True)
 class WithInexact:
-    """The fit with the knowns where they fit best, or as given where they are only reckoned with; covariance (12, 12)
-    of the cell with theirs; contributions: of each of them to it (12, 12), by what it is.
+    """The fit with the knowns where they fit best, or as given where they are only reckoned with; covariance
+    (12 + m, 12 + m) of the cell and of these; contributions: of each of them to the cell's (12, 12), by what it is.
     """
 
     fit: Fit
@@ -175,14 +188,15 @@ def fit_inexact(
             break
     follow = np.linalg.solve(fit.at.normal, cross)  # by how much the cell follows a change of the knowns, reversed
     spread = covariance if estimated else np.diag(sigmas**2)
-    total = np.linalg.inv(fit.at.normal) + follow @ spread @ follow.T
+    of_cell = np.linalg.inv(fit.at.normal) + follow @ spread @ follow.T
+    together = -follow @ spread
     # A prior's part in the estimate: how its own error comes through.
     through = follow @ covariance @ np.diag(precision) if estimated else follow
     return WithInexact(
         fit=fit,
         model=model,
         knowns=model.knowns,
-        covariance=np.asarray(total, dtype=float),
+        covariance=np.block([[of_cell, together], [together.T, spread]]),
         known=tuple(_known(inexact, theta, sigmas, np.sqrt(np.diag(covariance)), estimated)),
         contributions={
             one.what: through[:, at]
@@ -205,16 +219,7 @@ def _information(
     """Of the cell with the knowns (12, m), of these among themselves (m, m), the arms marginalised from both; gradient
     (m,) at the fit, where the arms' errors already are at their best.
     """
-    steps = np.concatenate([_STEP * one.scale for one in inexact])
-    columns = []
-    for i, step in enumerate(steps):
-        ends = []
-        for sign in (1, -1):
-            shifted = theta.copy()
-            shifted[i] += sign * step
-            ends.append(Model(data, _shifted(knowns, inexact, shifted), noise).residuals(fit.state))
-        columns.append((ends[0] - ends[1]).reshape(model.captures, -1) / (2 * step))
-    D = np.stack(columns, axis=-1)
+    D = by_inexact(data, knowns, noise, inexact, fit.state, theta)
     at = fit.at
     r = model.residuals(fit.state).reshape(model.captures, -1)
     towards_pose = np.swapaxes(model.jacobian(fit.state), 1, 2) @ D
@@ -233,6 +238,26 @@ def _information(
     summed = summed - at.arrival_normal @ at.towards_active @ folded
     cross = np.einsum("aci,acm->im", at.towards_cell, summed)
     return cross.reshape(CELL, -1), own, np.einsum("kri,kr->i", D, r)
+
+
+def by_inexact(
+    data: CaptureArrays,
+    knowns: Knowns,
+    noise: Noise,
+    inexact: Sequence[Inexact],
+    state: State,
+    theta: Array | None = None,
+) -> Array:
+    """(k, 2n, m): how the residuals, in units of sigma, change with the numbers by which knowns are off, around
+    ``theta`` (m,), zero by default.
+    """
+    steps = np.concatenate([np.zeros(0), *(_STEP * one.scale for one in inexact)])
+    there = np.zeros(len(steps)) if theta is None else theta
+    columns = np.empty((len(data), 2 * data.pixels.shape[1], len(steps)))
+    for i, step in enumerate(np.diag(steps)):
+        ends = (Model(data, _shifted(knowns, inexact, there + by), noise).residuals(state) for by in (step, -step))
+        columns[..., i] = np.subtract(*ends).reshape(len(data), -1) / (2 * steps[i])
+    return columns
 
 
 def _inner(towards: Array, normal: Array) -> Array:
@@ -262,8 +287,8 @@ def _slices(inexact: Sequence[Inexact]) -> list[slice]:
 
 
 def _known(inexact: Sequence[Inexact], theta: Array, prior: Array, posterior: Array, estimated: bool) -> list[Known]:
-    names = [name for one in inexact for name in one.names]
+    names = [both for one in inexact for both in zip(one.names, one.units, strict=True)]
     return [
-        Known(name, float(value), float(before), float(after if estimated else before), bool(after < UNSEEN * before))
-        for name, value, before, after in zip(names, theta, prior, posterior, strict=True)
+        Known(*both, float(value), float(before), float(after if estimated else before), bool(after < UNSEEN * before))
+        for both, value, before, after in zip(names, theta, prior, posterior, strict=True)
     ]

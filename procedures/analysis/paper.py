@@ -1,4 +1,4 @@
-"""From captures and a cell to a result. No device, repeatable on any session."""
+"""A result by the two steps of the paper."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from dataclasses import asdict
 
 import numpy as np
 
-from dualcal_hal.config import METHODS, CellConfig
-from dualcal_hal.errors import DegenerateCaptures, UsageError
+from dualcal_hal.config import CellConfig
+from dualcal_hal.errors import DegenerateCaptures
 from dualcal_hal.robot import Joints
 from dualcal_hal.session.captures import CaptureRecord, Captures, Use
-from dualcal_hal.session.result import Mismatch, Rejected, Result, Unobservable
+from dualcal_hal.session.result import Rejected, Result, Unobservable
 from dualcal_hal.transforms import Array
-from procedures.estimation import Degenerate, Estimate, Iteration, Statistics, estimate, judge, mismatch, statistics
+from procedures.analysis.verification import CalibratedPlaces, mismatch_of, mismatch_record, poses, words_for
+from procedures.estimation import Degenerate, Estimate, Iteration, estimate, judge
 
 FARTHEST_ALIGNED = 1.0
 """px in each axis; a feature point farther from the principal point than this does not count as aligned, one within
@@ -27,39 +28,37 @@ FARTHEST_ARRIVED = 5e-3
 """rad; an active joint farther than this from where the constraint's others have it stands on another axis."""
 
 
-def analyse(captures: Captures, cell: CellConfig, method: str) -> Result:
+def analyse_as_paper(captures: Captures, cell: CellConfig) -> Result:
     """Estimate from the calibration captures, verify on the others.
 
     Rejected is a verification capture on a constraint or arrival that was calibrated with, a capture whose feature
     point is not aligned, and one for which the active arm stood elsewhere than for its constraint's others. Raises
-    UsageError for an unknown method and DegenerateCaptures for captures that do not determine the transforms.
+    DegenerateCaptures for captures that do not determine the transforms.
     """
-    if method not in METHODS:
-        raise UsageError(f"unknown method '{method}'; there are: {', '.join(METHODS)}")
     used, rejected = _sort_out(captures.captures, cell)
     calibration = [capture for capture in used if capture.use == "calibration"]
     verification = [capture for capture in used if capture.use == "verification"]
     try:
         found = _estimate(calibration, cell)
     except Degenerate as error:
-        reasons = "; ".join([str(error), *_summary(rejected)])
+        reasons = "; ".join([str(error), *words_for(rejected)])
         raise DegenerateCaptures(f"the captures do not determine the transforms: {reasons}") from error
-    before = _statistics(verification, cell, cell.nominal.T_P_A, cell.nominal.T_H_E)
-    after = _statistics(verification, cell, found.T_P_A, found.T_H_E)
+    before = mismatch_of(verification, cell, cell.nominal.T_P_A, cell.nominal.T_H_E)
+    after = mismatch_of(verification, cell, found.T_P_A, found.T_H_E)
     verdict, reason = judge(after, cell.procedure.verification.limit)
     return Result(
-        method=method,
+        method="paper",
         T_P_A=found.T_P_A,
         T_H_E=found.T_H_E,
         optical_axis=found.optical_axis,
         unobservable=tuple(Unobservable(**asdict(direction)) for direction in found.unobservable),
         iterations=tuple(_iteration_record(iteration) for iteration in found.iterations),
-        mismatch_before=_record(before),
-        mismatch_after=_record(after),
+        mismatch_before=mismatch_record(before),
+        mismatch_after=mismatch_record(after),
         captures_used=tuple(capture.id for capture in calibration),
         captures_rejected=rejected,
         verdict=verdict,
-        reasons=(reason, *found.warnings, *_summary(rejected)),
+        reasons=(reason, *found.warnings, *words_for(rejected)),
     )
 
 
@@ -72,9 +71,7 @@ def _active_joints(captures: Sequence[CaptureRecord]) -> dict[tuple[Use, str], A
 
 
 def _sort_out(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[list[CaptureRecord], tuple[Rejected, ...]]:
-    calibrated = [capture for capture in captures if capture.use == "calibration"]
-    constraints = {capture.constraint for capture in calibrated}
-    arrivals = {capture.active_arrival for capture in calibrated}
+    calibrated = CalibratedPlaces.of(captures)
     stands = _active_joints(captures)
     used, rejected = [], []
     thinned: set[tuple[Use, str]] = set()
@@ -87,10 +84,8 @@ def _sort_out(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[list
         elif moved > FARTHEST_ARRIVED:
             degrees = np.rad2deg(moved)
             reason = f"the active arm stands {degrees:.2f} deg from where the others of {capture.constraint} have it"
-        elif capture.use == "verification" and (
-            capture.constraint in constraints or capture.active_arrival in arrivals
-        ):
-            reason = f"verification on constraint {capture.constraint}, which was calibrated with"
+        elif capture.use == "verification" and calibrated.has(capture):
+            reason = calibrated.reason(capture)
         else:
             used.append(capture)
             continue
@@ -110,32 +105,9 @@ def _sort_out(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[list
 
 
 def _estimate(captures: Sequence[CaptureRecord], cell: CellConfig) -> Estimate:
-    T_A_H, T_P_T = _poses(captures, cell)
+    T_A_H, T_P_T = poses(captures, cell)
     constraints = [capture.constraint for capture in captures]
     return estimate(T_A_H, T_P_T, constraints, cell.nominal.T_P_A, cell.nominal.T_H_E)
-
-
-def _statistics(captures: Sequence[CaptureRecord], cell: CellConfig, T_P_A: Array, T_H_E: Array) -> Statistics | None:
-    if not captures:
-        return None
-    T_A_H, T_P_T = _poses(captures, cell)
-    return statistics(mismatch(T_P_A, T_H_E, T_A_H, T_P_T[:, :3, 3]))
-
-
-def _poses(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[Array, Array]:
-    """T_A_H and T_P_T (k, 4, 4)."""
-    active = np.array([capture.active_joints for capture in captures]).reshape(-1, cell.active.chain.joints)
-    passive = np.array([capture.passive_joints for capture in captures]).reshape(-1, cell.passive.chain.joints)
-    T_P_F = cell.passive.chain.forward(passive)
-    return cell.active.chain.forward(active), T_P_F @ cell.passive.target_mount_transform
-
-
-def _record(statistics: Statistics | None) -> Mismatch | None:
-    return None if statistics is None else Mismatch(**asdict(statistics))
-
-
-def _summary(rejected: Sequence[Rejected]) -> list[str]:
-    return [f"{len(rejected)} captures rejected, the first {rejected[0].id}: {rejected[0].reason}"] if rejected else []
 
 
 def _iteration_record(iteration: Iteration) -> dict[str, float | list[float]]:

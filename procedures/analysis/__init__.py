@@ -1,0 +1,27 @@
+"""From captures and a cell to a result. No device, repeatable on any session."""
+
+from __future__ import annotations
+
+from dualcal_hal.config import METHODS, CellConfig
+from dualcal_hal.errors import UsageError
+from dualcal_hal.session.captures import Captures
+from dualcal_hal.session.result import Result
+from procedures.analysis.paper import analyse_as_paper
+from procedures.analysis.refined import FREE, Choices, analyse_refined
+
+__all__ = ["FREE", "Choices", "analyse"]
+
+
+def analyse(captures: Captures, cell: CellConfig, method: str, choices: Choices | None = None) -> Result:
+    """Estimate from the calibration captures, verify on the others.
+
+    choices: of the refined method alone. Raises UsageError for an unknown method or choices that are not for it, and
+    DegenerateCaptures for captures that do not determine the transforms.
+    """
+    if method == "refined":
+        return analyse_refined(captures, cell, choices or Choices())
+    if method != "paper":
+        raise UsageError(f"unknown method '{method}'; there are: {', '.join(METHODS)}")
+    if choices is not None:
+        raise UsageError("--noise, --keep-all and --free are for method refined")
+    return analyse_as_paper(captures, cell)

@@ -1,0 +1,175 @@
+"""A result by maximum likelihood over all corners, with what it is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualcal_hal.config import CellConfig
+from dualcal_hal.errors import DegenerateCaptures, UsageError
+from dualcal_hal.session.accuracy import Accuracy, Verification, VerifiedCaptureRecord
+from dualcal_hal.session.captures import CaptureRecord, Captures
+from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Rejected, Result, Unobservable, Verdict
+from dualcal_hal.transforms import Array
+from procedures.analysis.accuracy import accuracy_record, region_of
+from procedures.analysis.knowns import arrays, given_knowns, inexact_knowns, stated_noise
+from procedures.analysis.verification import CalibratedPlaces, mismatch_of, mismatch_record, words_for
+from procedures.estimation import Degenerate
+from procedures.estimation.refined import Inexact, Refined, refined
+from procedures.estimation.refined.suspects import Suspect, next_suspects
+from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, verify
+
+FREE = ("target_mount", "intrinsics")
+"""Knowns that can be left to the captures altogether."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """find_noise: the sigmas are found from the captures; keep_all: no capture is dropped; free: of ``FREE``."""
+
+    find_noise: bool = False
+    keep_all: bool = False
+    free: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in self.free:
+            if name not in FREE:
+                raise UsageError(
+                    f"--free {name}: only {' and '.join(FREE)} can be free; a sigma in the cell file may do"
+                )
+
+
+def analyse_refined(captures: Captures, cell: CellConfig, choices: Choices) -> Result:
+    """Estimate from the calibration captures, verify on the others.
+
+    Rejected is a verification capture on a constraint or arrival that was calibrated with, and what is no part of the
+    rest. Raises DegenerateCaptures for captures that do not determine the transforms.
+    """
+    calibration, verification, rejected = _sort_out(captures.captures)
+    inexact = inexact_knowns(cell, choices.free)
+    found = _estimate(calibration, cell, choices, inexact)
+    rejected += tuple(Rejected(calibration[one.capture].id, one.reason) for one in found.dropped)
+    looked_at = _looked_at(verification, cell, found)
+    region = region_of(cell, verification or calibration)
+    accuracy = accuracy_record(found, cell, calibration, [*calibration, *verification], region, stated_noise(cell))
+    suspects = _suspects(looked_at, found, calibration, verification, cell)
+    verdict, reasons = _judge(looked_at, suspects, accuracy)
+    before = mismatch_of(verification, cell, cell.nominal.T_P_A, cell.nominal.T_H_E)
+    after = mismatch_of(verification, cell, found.T_P_A, found.T_H_E)
+    return Result(
+        method="refined",
+        T_P_A=found.T_P_A,
+        T_H_E=found.T_H_E,
+        optical_axis=found.T_H_E[:3, 2],
+        unobservable=_unobservable(found),
+        iterations=(),
+        mismatch_before=mismatch_record(before),
+        mismatch_after=mismatch_record(after),
+        captures_used=tuple(capture.id for capture, used in zip(calibration, found.used, strict=True) if used),
+        captures_rejected=rejected,
+        verdict=verdict,
+        reasons=(*reasons, *found.warnings, *words_for(rejected)),
+        accuracy=accuracy,
+        verification=None if looked_at is None else _verification_record(looked_at, suspects, verification),
+    )
+
+
+def _sort_out(
+    captures: Sequence[CaptureRecord],
+) -> tuple[list[CaptureRecord], list[CaptureRecord], tuple[Rejected, ...]]:
+    """For the estimate, for the proof, and those for neither."""
+    calibrated = CalibratedPlaces.of(captures)
+    verification = [capture for capture in captures if capture.use == "verification"]
+    return (
+        [capture for capture in captures if capture.use == "calibration"],
+        [capture for capture in verification if not calibrated.has(capture)],
+        tuple(Rejected(capture.id, calibrated.reason(capture)) for capture in verification if calibrated.has(capture)),
+    )
+
+
+def _estimate(
+    calibration: Sequence[CaptureRecord], cell: CellConfig, choices: Choices, inexact: Sequence[Inexact]
+) -> Refined:
+    try:
+        return refined(
+            arrays(calibration, cell),
+            given_knowns(cell),
+            stated_noise(cell),
+            further_starts=[(cell.nominal.T_P_A, cell.nominal.T_H_E)],
+            keep_all=choices.keep_all,
+            estimate_noise=choices.find_noise,
+            inexact=inexact,
+            estimate_inexact=cell.procedure.knowns == "estimate" or bool(choices.free),
+        )
+    except Degenerate as error:
+        raise DegenerateCaptures(f"the captures do not determine the transforms: {error}") from error
+
+
+def _looked_at(verification: Sequence[CaptureRecord], cell: CellConfig, found: Refined) -> Consistency | None:
+    return verify(found, arrays(verification, cell)) if verification else None
+
+
+def _suspects(
+    looked_at: Consistency | None,
+    found: Refined,
+    calibration: Sequence[CaptureRecord],
+    verification: Sequence[CaptureRecord],
+    cell: CellConfig,
+) -> tuple[Suspect, ...]:
+    """What to look at next, where the verification captures are not as predicted."""
+    if looked_at is None or looked_at.fits:
+        return ()
+    used = [capture for capture, kept in zip(calibration, found.used, strict=True) if kept]
+    return next_suspects(found, arrays([*used, *verification], cell))
+
+
+def _judge(
+    looked_at: Consistency | None, suspects: Sequence[Suspect], accuracy: Accuracy
+) -> tuple[Verdict, tuple[str, ...]]:
+    space = accuracy.error_3d
+    predicted = f"predicted 3D error of at most {space.p95_mm:.2g} mm (95 %) in the region"
+    if looked_at is None:
+        return "unverified", ("no verification captures: nothing shows that the noise is as stated", predicted)
+    said = (
+        f"chi-square {looked_at.statistic:.0f} of {looked_at.freedom:.0f} on {len(looked_at.captures)} captures,"
+        f" probability {looked_at.probability:.2g}"
+    )
+    if not looked_at.fits:
+        return "fail", (
+            f"the verification captures are not where they are predicted, for the stated noise: {said}",
+            *(f"look next at {suspect.words}" for suspect in suspects[:1]),
+        )
+    reasons = (f"the verification captures are where they are predicted: {said}",)
+    if space.p95_mm > space.required_mm:
+        return "coarse", (f"{predicted}, above the {space.required_mm:g} mm required", *reasons)
+    return "ok", (f"{predicted}, within the {space.required_mm:g} mm required", *reasons)
+
+
+def _verification_record(
+    looked_at: Consistency, suspects: Sequence[Suspect], verification: Sequence[CaptureRecord]
+) -> Verification:
+    return Verification(
+        chi_square=looked_at.statistic,
+        degrees_of_freedom=looked_at.freedom,
+        probability=looked_at.probability,
+        least_probability=LEAST_PROBABILITY,
+        captures=tuple(
+            VerifiedCaptureRecord(id=capture.id, chi_square=square, degrees_of_freedom=freedom)
+            for capture, square, freedom in zip(
+                verification, looked_at.captures.tolist(), looked_at.freedoms.tolist(), strict=True
+            )
+        ),
+        look_at=tuple(suspect.words for suspect in suspects),
+    )
+
+
+def _unobservable(found: Refined) -> tuple[Unobservable, ...]:
+    entries = []
+    for index, direction in enumerate(found.directions):
+        if not direction.observable:
+            of, axis = divmod(index, 6)
+            unit: Array = np.eye(6)[axis]
+            entries.append(Unobservable(direction.name, tuple(unit.tolist()), (T_P_A_NAME, T_H_E_NAME)[of]))
+    return tuple(entries)

@@ -200,7 +200,8 @@ class OneArm:
 
     def spatial_error(self, points: ArrayLike) -> SpatialError:
         """Predicted, of where points (..., 3) of the camera are put in the frame that carries it, m."""
-        return spatial_error(self.camera, self.covariance[:6, :6], apply(self.camera, points))
+        there = apply(self.camera, np.reshape(points, (-1, 3))).reshape(np.shape(points))
+        return spatial_error(self.camera, self.covariance[:6, :6], there)
 
 
 def one_arm(

@@ -1,0 +1,287 @@
+"""From photographs with flange poses to a result. No device, no cell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+
+import cv2
+import numpy as np
+
+from dualcal_hal.camera import Image, Intrinsics
+from dualcal_hal.errors import DegenerateCaptures, FormatError, Problem
+from dualcal_hal.session.images import require_bearable
+from dualcal_hal.session.triples_result import Found
+from dualcal_hal.session.views import View, ViewsFile
+from dualcal_hal.session.views_result import (
+    Attempt,
+    NoiseUsed,
+    PlacementFound,
+    Predicted,
+    Residue,
+    ViewResult,
+    ViewsResult,
+)
+from dualcal_hal.transforms import Array, inverse
+from procedures.detection import Detection, Detector, Missed
+from procedures.estimation import Degenerate
+from procedures.estimation.refined.as_read import fit_as_read
+from procedures.estimation.refined.breakdown import FREE_LENS, Breakdown, break_down
+from procedures.estimation.refined.inexact import Inexact
+from procedures.estimation.refined.left_out import LeftOut, leave_one_out
+from procedures.estimation.refined.one_arm import FlangePoses, OneArm, Placement, Views, one_arm
+from procedures.views_verdict import verdict_of
+
+PIXEL = 0.1
+"""px: sigma of a corner, where none is stated and as long as none is found."""
+TRANSLATION, ROTATION = 1e-3, 1e-3
+"""m and rad: of a flange pose, as long as none is found; what is found keeps their ratio."""
+
+_TELLS = 3.0  # times that the corners must be farther off with the other placement
+_BETTER = 0.9  # of left-out errors: below, the arm is taken where it was read
+_MOST_BYTES = 200_000_000
+
+AS_READ, WITH_ERRORS = "as read", "with errors"
+
+
+@dataclass(frozen=True)
+class StatedNoise:
+    """Sigmas per axis: of a corner, px, and of a flange pose, m and rad."""
+
+    pixel: float
+    translation: float
+    rotation: float
+
+
+@dataclass(frozen=True)
+class ViewsChoices:
+    """noise: None for what the views show; free_intrinsics: focal lengths, centre and distortion are estimated too."""
+
+    noise: StatedNoise | None = None
+    free_intrinsics: bool = False
+    keep_all: bool = False
+
+    @property
+    def inexact(self) -> Sequence[Inexact]:
+        return FREE_LENS if self.free_intrinsics else ()
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Images of the views, and what was found in them; size: of all images, px."""
+
+    images: tuple[Image, ...]
+    outcomes: tuple[Detection | Missed, ...]
+    size: tuple[int, int]
+
+    @property
+    def corners(self) -> int:
+        return sum(int(found.seen.sum()) for found in self.outcomes if isinstance(found, Detection))
+
+
+def look_at(file: ViewsFile) -> Seen:
+    """Detect the target in all images; FormatError for what is no image, or of another size than the camera's."""
+    images: list[Image] = []
+    problems = []
+    for view in file.views:
+        try:
+            images.append(_read_image(view))
+        except ValueError as error:
+            problems.append(Problem(str(view.image), str(error)))
+    if problems:
+        raise FormatError(problems)
+    height, width = images[0].shape
+    size = (width, height) if file.intrinsics.size == (0, 0) else file.intrinsics.size
+    for view, image in zip(file.views, images, strict=True):
+        if image.shape != size[::-1]:
+            of = "the camera's size_px is" if file.intrinsics.size == size else "the first one has"
+            said = f"has {image.shape[1]} x {image.shape[0]} px, {of} {size[0]} x {size[1]}"
+            problems.append(Problem(str(view.image), said))
+    if problems:
+        raise FormatError(problems)
+    detector = Detector(file.board, size)
+    return Seen(tuple(images), tuple(detector.detect(image) for image in images), size)
+
+
+def _read_image(view: View) -> Image:
+    """Grey, as the sensor has it: not turned as a note in the file may ask for."""
+    if view.image.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"is larger than {_MOST_BYTES} bytes")
+    try:
+        image = cv2.imread(str(view.image), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        raise ValueError(f"is no image that can be read: {error.err}") from error
+    if image is None:
+        raise ValueError("is no image that can be read")
+    require_bearable(image.shape[1], image.shape[0])
+    return np.asarray(image, dtype=np.uint8)
+
+
+def analyse_views(file: ViewsFile, seen: Seen, choices: ViewsChoices) -> ViewsResult:
+    """Estimate from what was found in the images; DegenerateCaptures for views that do not determine the transforms."""
+    noise = choices.noise or StatedNoise(PIXEL, TRANSLATION, ROTATION)
+    views = _views(file, seen, noise)
+    try:
+        placement = _placement(file, views, noise)
+        likely = one_arm(
+            views,
+            Placement(placement.name),
+            noise.pixel,
+            keep_all=choices.keep_all,
+            estimate_noise=choices.noise is None,
+            inexact=choices.inexact,
+        )
+        fits = {WITH_ERRORS: likely}
+        if choices.noise is None:
+            fits[AS_READ] = fit_as_read(views, likely, choices.inexact)
+        left_out = {name: leave_one_out(views, fit, choices.inexact) for name, fit in fits.items()}
+        broken_down = break_down(views, likely)
+    except Degenerate as error:
+        raise DegenerateCaptures(f"{file.path}: the views do not tell where camera and target are: {error}") from error
+    attempts = {name: _attempt(fit, left_out[name]) for name, fit in fits.items()}
+    best = WITH_ERRORS
+    if AS_READ in attempts and attempts[AS_READ].left_out_px < _BETTER * attempts[WITH_ERRORS].left_out_px:
+        best = AS_READ
+    result = _result(file, seen, choices, placement, fits[best], left_out[best], broken_down)
+    result = replace(result, attempts=attempts)
+    verdict, reasons = verdict_of(result, likely.scale if choices.noise is not None else 1.0)
+    return replace(result, verdict=verdict, reasons=reasons)
+
+
+def _views(file: ViewsFile, seen: Seen, noise: StatedNoise) -> Views:
+    corners = len(file.board.corners)
+    nothing = np.full((corners, 2), np.nan)
+    pixels = np.stack([found.corners if isinstance(found, Detection) else nothing for found in seen.outcomes])
+    order_known = np.array([not isinstance(found, Detection) or found.order_known for found in seen.outcomes])
+    if not order_known.any() or not np.isfinite(pixels[order_known]).any():
+        # Turned by half a turn in all views it is the same board: the best one seen says which way up it is.
+        order_known[np.argmax(np.isfinite(pixels[..., 0]).sum(axis=1))] = True
+    return Views(
+        arm=FlangePoses(file.flanges, noise.translation, noise.rotation),
+        pixels=pixels,
+        corners=file.board.corners,
+        matrix=file.intrinsics.matrix,
+        distortion=file.intrinsics.distortion,
+        order_known=order_known,
+    )
+
+
+def _placement(file: ViewsFile, views: Views, noise: StatedNoise) -> PlacementFound:
+    """As the file states it, else the one with which the corners are far less off."""
+    if file.placement is not None:
+        return PlacementFound(file.placement, True, None)
+    off, reasons = {}, {}
+    for placement in Placement:
+        try:
+            off[placement] = _typically_off(one_arm(views, placement, noise.pixel))
+        except Degenerate as error:
+            reasons[placement] = error
+    if not off:
+        raise reasons[Placement.ON_ARM]
+    best, *others = sorted(off, key=lambda placement: off[placement])
+    if not others:
+        return PlacementFound(best.value, False, None)
+    ratio = off[others[0]] / off[best]
+    if ratio < _TELLS:
+        raise Degenerate(
+            "whether the camera is on the arm or stays beside it does not show; write "
+            f'"placement": "{Placement.ON_ARM}" or "{Placement.FIXED}" into the file'
+        )
+    return PlacementFound(best.value, False, ratio)
+
+
+def _typically_off(fit: OneArm) -> float:
+    """px: the median over all views, used or not, of a corner's distance in each axis."""
+    seen = np.isfinite(fit.residuals).any(axis=(1, 2))
+    return float(np.median(np.sqrt(np.nanmean(fit.residuals[seen] ** 2, axis=(1, 2))))) + 1e-3
+
+
+def _attempt(fit: OneArm, left_out: LeftOut) -> Attempt:
+    pixels, metres = (values[fit.used] for values in left_out.rms())
+    return Attempt(fit.rms, float(np.sqrt(np.mean(pixels**2))), float(np.sqrt(np.mean(metres**2))))
+
+
+def _result(
+    file: ViewsFile,
+    seen: Seen,
+    choices: ViewsChoices,
+    placement: PlacementFound,
+    fit: OneArm,
+    left_out: LeftOut,
+    broken_down: Breakdown,
+) -> ViewsResult:
+    found = fit.found
+    lever = TRANSLATION / ROTATION if choices.noise is None else choices.noise.translation / choices.noise.rotation
+    row, column = divmod(file.board.feature, file.board.columns)
+    given = replace(file.intrinsics, size=seen.size)
+    return ViewsResult(
+        placement=placement,
+        transforms={name: Found(T, fit.covariance_of(name)) for name, T in fit.transforms.items()},
+        covariance=fit.covariance,
+        poses=AS_READ if fit.as_read else WITH_ERRORS,
+        attempts={},
+        noise=NoiseUsed(
+            fit.pixel_sigma,
+            lever * fit.arm_sigma,
+            fit.arm_sigma,
+            found is not None,
+            {} if found is None else {"corners": found.pixel.identified, "flange": found.joint.identified},
+        ),
+        rms=fit.rms,
+        residue=Residue(**asdict(broken_down)),
+        camera_error=_predicted(fit, np.zeros(3)),
+        point_error=_predicted(fit, _middle(file, fit)),
+        views=tuple(_view_results(file, seen, fit, left_out)),
+        intrinsics_given=given,
+        distortion_known=file.distortion_known,
+        intrinsics=Intrinsics(fit.matrix, fit.distortion, seen.size),
+        intrinsics_sigmas={known.name: known.sigma for known in fit.known},
+        corners=file.board.corners,
+        feature=(row, column),
+        verdict="",
+        reasons=(),
+        warnings=tuple(_warnings(file, fit)),
+    )
+
+
+def _middle(file: ViewsFile, fit: OneArm) -> Array:
+    """(3,): where the targets were on average, in the camera."""
+    flanges = file.flanges[fit.used]
+    carried = flanges if fit.placement is Placement.FIXED else inverse(flanges)
+    return np.asarray((inverse(fit.camera) @ carried @ fit.target)[:, :3, 3].mean(axis=0))
+
+
+def _predicted(fit: OneArm, point: Array) -> Predicted:
+    error = fit.spatial_error(point)
+    return Predicted(float(error.rms), float(error.p95))
+
+
+def _view_results(file: ViewsFile, seen: Seen, fit: OneArm, left_out: LeftOut) -> Iterator[ViewResult]:
+    dropped = {drop.capture: drop.reason for drop in fit.dropped}
+    pixels, metres = left_out.rms()
+    distances = np.sqrt(fit.distances / np.maximum(fit.freedoms, 1))
+    nothing = np.full((len(file.board.corners), 2), np.nan)
+    for k, (view, found) in enumerate(zip(file.views, seen.outcomes, strict=True)):
+        missed = str(found) if isinstance(found, Missed) else None
+        corners = nothing
+        if isinstance(found, Detection):
+            corners = found.corners[::-1] if fit.flipped[k] else found.corners
+        yield ViewResult(
+            name=view.name,
+            image=str(view.image),
+            missed=missed,
+            dropped=None if missed else dropped.get(k),
+            corners=corners,
+            residuals=fit.residuals[k],
+            left_out_px=float(pixels[k]),
+            left_out=float(metres[k]),
+            distance=float(distances[k]),
+        )
+
+
+def _warnings(file: ViewsFile, fit: OneArm) -> Iterator[str]:
+    yield from fit.warnings
+    if not file.distortion_known and not fit.known:
+        yield "the lens's distortion is not known, by the file; none was reckoned with: --free intrinsics finds it"
+    if fit.found is not None and not fit.found.joint.identified:
+        yield "an error of the flange poses cannot be told from none; its upper bound was reckoned with"

@@ -80,8 +80,9 @@ class Refined:
     its degrees of freedom. flipped (k,): captures taken with their corners from the other end. used (k,).
 
     noise, knowns: what was reckoned with; found: what the captures themselves say of the noise, if that was asked for;
-    known: inexact knowns after the estimate. contributions: to the covariance (12, 12), of pixels, of the joints of
-    both arms and of each inexact known.
+    inexact: knowns that were not taken as exact, and known: what they are after the estimate; joint_covariance
+    (12 + m, 12 + m): of the cell with their m numbers. contributions: to the covariance (12, 12), of pixels, of the
+    joints of both arms and of each inexact known.
     """
 
     T_P_A: Array
@@ -105,7 +106,9 @@ class Refined:
     noise: Noise
     knowns: Knowns
     contributions: dict[str, Array]
+    joint_covariance: Array
     found: FoundNoise | None = None
+    inexact: tuple[Inexact, ...] = ()
     known: tuple[Known, ...] = ()
 
     def spatial_error(self, points: ArrayLike) -> SpatialError:
@@ -146,7 +149,8 @@ def refined(
         result = replace(result, found=found, warnings=(*result.warnings, *_noise_warnings(found)))
     if not inexact:
         return result
-    return _combined(result, _with_inexact(data, knowns, result.noise, result, inexact, estimate_inexact), fixed[2])
+    found_knowns = _with_inexact(data, knowns, result.noise, result, inexact, estimate_inexact)
+    return _combined(result, found_knowns, inexact, fixed[2])
 
 
 def _kept(data: CaptureArrays, result: Refined) -> CaptureArrays:
@@ -161,9 +165,11 @@ def _with_inexact(
     return fit_inexact(kept, knowns, noise, start, inexact, estimated)
 
 
-def _combined(result: Refined, found: WithInexact, observable: Limits) -> Refined:
+def _combined(result: Refined, found: WithInexact, inexact: Sequence[Inexact], observable: Limits) -> Refined:
     """With the inexact knowns in estimate and covariance; what was widened for the residuals stays so."""
-    covariance = found.covariance - np.linalg.inv(found.fit.at.normal) + result.covariance
+    joint = found.covariance.copy()
+    joint[:CELL, :CELL] += result.covariance - np.linalg.inv(found.fit.at.normal)
+    covariance = joint[:CELL, :CELL]
     hidden = [known.name for known in found.known if not known.seen]
     words = [f"cannot be seen in the captures: {', '.join(hidden)}"] if hidden else []
     return replace(
@@ -171,7 +177,9 @@ def _combined(result: Refined, found: WithInexact, observable: Limits) -> Refine
         T_P_A=found.fit.state.T_P_A,
         T_H_E=found.fit.state.T_H_E,
         covariance=covariance,
+        joint_covariance=joint,
         directions=directions(covariance, observable),
+        inexact=tuple(inexact),
         known=found.known,
         knowns=found.knowns,
         contributions={**result.contributions, **found.contributions},
@@ -402,6 +410,7 @@ def _result(
         noise=search.every.noise,
         knowns=search.every.knowns,
         contributions=contributions,
+        joint_covariance=covariance,
     )
 
 

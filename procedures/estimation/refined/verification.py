@@ -30,7 +30,7 @@ class Consistency:
     corner_freedom: how far the corners are from one board each, wherever that is. Both parts are independent, and
     either may give the others away: corners better than stated must not hide boards that are elsewhere.
 
-    hidden: by how much ``poses`` is smaller on average, at most, since captures were accepted within a tolerance.
+    hidden: by how much ``statistic`` is smaller on average, at most, since captures were accepted within a tolerance.
     """
 
     captures: Array

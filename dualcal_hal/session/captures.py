@@ -10,13 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
 
 from dualcal_hal.config import CellConfig
 from dualcal_hal.errors import FormatError, Problem
 from dualcal_hal.robot import Joints
 from dualcal_hal.session.files import read_document, write_document
 from dualcal_hal.session.plain import LARGEST
+from dualcal_hal.transforms import is_rotation
 
 FORMAT = "dualcal.captures/1"
 
@@ -28,6 +30,23 @@ Pixel = tuple[float, float]
 
 
 @dataclass(frozen=True)
+class BoardPose:
+    """Where another program saw the target in the camera: matrix (4, 4), m; covariance (6, 6) or None: of
+    log(seen^-1 true), translation (m) then rotation (rad), in the target's frame.
+    """
+
+    matrix: tuple[tuple[float, ...], ...]
+    covariance: tuple[tuple[float, ...], ...] | None = None
+
+    def to_record(self) -> dict[str, Any]:
+        """The value as in the file."""
+        matrix = [list(row) for row in self.matrix]
+        if self.covariance is None:
+            return {"matrix": matrix}
+        return {"matrix": matrix, "covariance": [list(row) for row in self.covariance]}
+
+
+@dataclass(frozen=True)
 class CaptureRecord:
     """One datum.
 
@@ -35,7 +54,8 @@ class CaptureRecord:
     arrived anew (captures that share it share that arm's error); joints: rad, mean of the readings before and after
     the exposure; feature, corners: px in the distorted image, corners by index on the board, None for one that was not
     seen, or None altogether; image_size: width and height, px; aligned: whether the feature was within the tolerance;
-    order_known: False where two orientations of the pattern fitted.
+    order_known: False where two orientations of the pattern fitted; board_pose: of the target, in place of corners that
+    another program does not tell; the feature is NaN then until the camera is known.
     """
 
     id: str
@@ -50,6 +70,7 @@ class CaptureRecord:
     image_size: tuple[int, int]
     aligned: bool = True
     order_known: bool = True
+    board_pose: BoardPose | None = None
 
     def to_record(self) -> dict[str, Any]:
         """The entry as in the file."""
@@ -66,6 +87,7 @@ class CaptureRecord:
             "image_px": list(self.image_size),
             "aligned": self.aligned,
             "order": "known" if self.order_known else "unknown",
+            **({} if self.board_pose is None else {"target_in_camera": self.board_pose.to_record()}),
         }
 
     @classmethod
@@ -165,6 +187,35 @@ def _number_as_name(value: Any) -> Any:
 _Name = Annotated[str, Field(strict=True, min_length=1), BeforeValidator(_number_as_name)]
 
 
+_Row4 = tuple[_Finite, _Finite, _Finite, _Finite]
+_Row6 = tuple[_Finite, _Finite, _Finite, _Finite, _Finite, _Finite]
+
+
+class _BoardPose(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+    matrix: tuple[_Row4, _Row4, _Row4, _Row4]
+    covariance: tuple[_Row6, _Row6, _Row6, _Row6, _Row6, _Row6] | None = None
+
+    @field_validator("matrix")
+    @classmethod
+    def _is_rigid(cls, value: tuple[_Row4, ...]) -> tuple[_Row4, ...]:
+        if value[3] != (0.0, 0.0, 0.0, 1.0) or not is_rotation(np.array(value)[:3, :3]):
+            raise ValueError("is no rigid transform (4 rows of 4 numbers, m)")
+        return value
+
+    @field_validator("covariance")
+    @classmethod
+    def _is_a_covariance(cls, value: tuple[_Row6, ...] | None) -> tuple[_Row6, ...] | None:
+        if value is None:
+            return None
+        matrix = np.array(value)
+        symmetric = np.allclose(matrix, matrix.T, rtol=1e-6, atol=0.0)
+        if not symmetric or np.linalg.eigvalsh(matrix)[0] <= 0:
+            raise ValueError("is no covariance: it must be symmetric with eigenvalues above 0")
+        return value
+
+
 class _Entry(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
@@ -175,8 +226,9 @@ class _Entry(BaseModel):
     active_arrival: _Whole | None = None
     active_joints_rad: _Joints
     passive_joints_rad: _Joints
-    feature_px: tuple[_Finite, _Finite]
-    corners_px: tuple[tuple[_Finite, _Finite] | None, ...] | None
+    target_in_camera: _BoardPose | None = None
+    feature_px: tuple[_Finite, _Finite] | None = None
+    corners_px: tuple[tuple[_Finite, _Finite] | None, ...] | None = None
     image_px: tuple[_Size, _Size]
     aligned: Annotated[bool, Field(strict=True)] = True
     order: Literal["known", "unknown"] = "known"
@@ -190,21 +242,35 @@ class _Entry(BaseModel):
             active_arrival=arrival,
             active_joints=self.active_joints_rad,
             passive_joints=self.passive_joints_rad,
-            feature=self.feature_px,
+            feature=self.feature_px or (np.nan, np.nan),
             corners=self.corners_px,
             image_size=self.image_px,
             aligned=self.aligned,
             order_known=self.order == "known",
+            board_pose=None if self.target_in_camera is None else BoardPose(**self.target_in_camera.model_dump()),
         )
 
 
 def _entry(record: Any, name: str) -> tuple[_Entry | None, list[Problem]]:
     if not isinstance(record, Mapping):
         return None, [Problem(name, "is not a JSON object")]
+    missing = list(_missing_sight(record, name))
     try:
-        return _Entry.model_validate(record), []
+        entry = _Entry.model_validate(record)
     except ValidationError as error:
-        return None, [Problem(name, _words(details)) for details in error.errors()]
+        return None, [*missing, *(Problem(name, _words(details)) for details in error.errors())]
+    return (None, missing) if missing else (entry, [])
+
+
+def _missing_sight(record: Mapping[str, Any], name: str) -> Iterator[Problem]:
+    """Pixels may be left out where another program says where it saw the target."""
+    if record.get("target_in_camera") is not None:
+        return
+    for key in ("feature_px", "corners_px"):
+        if key not in record:
+            yield Problem(name, f"{key}: missing; only an entry with target_in_camera goes without")
+    if "feature_px" in record and record["feature_px"] is None:
+        yield Problem(name, "feature_px: must be a list, not None")
 
 
 _WORDS = {
@@ -220,7 +286,7 @@ _WORDS = {
 
 def _words(details: Any) -> str:
     key, *indices = details["loc"]
-    where = f"{key}{''.join(f'[{index}]' for index in indices)}"
+    where = f"{key}{''.join(f'.{at}' if isinstance(at, str) else f'[{at}]' for at in indices)}"
     if details["type"] == "missing":
         return f"{where}: missing"
     said = _WORDS.get(details["type"], f"{details['msg'][0].lower()}{details['msg'][1:]}")

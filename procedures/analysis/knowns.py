@@ -10,6 +10,7 @@ from dualcal_hal.config import CellConfig, RobotConfig
 from dualcal_hal.errors import UsageError
 from dualcal_hal.session.captures import CaptureRecord
 from dualcal_hal.transforms import Array
+from procedures.analysis.board_poses import weights_of
 from procedures.analysis.verification import joints
 from procedures.estimation.refined import (
     CaptureArrays,
@@ -30,9 +31,9 @@ def arrays(captures: Sequence[CaptureRecord], cell: CellConfig) -> CaptureArrays
     active, passive = joints(captures, cell)
     pixels = np.full((len(captures), len(board.corners), 2), np.nan)
     for index, capture in enumerate(captures):
-        if capture.corners is None:
+        if capture.corners is None and capture.board_pose is None:
             pixels[index, board.feature] = capture.feature
-        else:
+        elif capture.corners is not None:
             pixels[index] = [corner or (np.nan, np.nan) for corner in capture.corners]
     return CaptureArrays(
         active=active,
@@ -40,6 +41,8 @@ def arrays(captures: Sequence[CaptureRecord], cell: CellConfig) -> CaptureArrays
         arrivals=np.array([capture.active_arrival for capture in captures]),
         pixels=pixels,
         order_known=np.array([capture.order_known for capture in captures], dtype=bool),
+        board_poses=[None if capture.board_pose is None else capture.board_pose.matrix for capture in captures],
+        weights=weights_of(captures, cell),
     )
 
 

@@ -16,6 +16,7 @@ from dualcal_hal.session.folder import Session
 from dualcal_hal.session.result import Rejected, read_truth, with_truth_error, write_result
 from dualcal_hal.transforms import Array
 from procedures.analysis import Choices, analyse
+from procedures.analysis.board_poses import with_corners
 from procedures.calibrate import captures_of, finished
 from procedures.redetection import detect_anew
 from tools.cli.show import show_result
@@ -162,7 +163,8 @@ def _journalled(folder: Path, file: CellFile, *, required: bool) -> Captures | N
 def _read(path: Path, cell: CellConfig) -> Captures:
     joints = (cell.active.chain.joints, cell.passive.chain.joints)
     board, size = cell.target.board, cell.camera.intrinsics.size
-    return read_captures(path, joints=joints, corners=len(board.corners), feature=board.feature, image_size=size)
+    read = read_captures(path, joints=joints, corners=len(board.corners), feature=board.feature, image_size=size)
+    return with_corners(read, cell)
 
 
 def _detected_anew(

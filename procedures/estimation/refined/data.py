@@ -22,6 +22,7 @@ class CaptureArrays:
     arrival of the active arm; pixels (k, n, 2): measured corners in the distorted image, NaN for one not seen;
     order_known (k,): False where the corners may as well be listed from the other end; None: all are known;
     board_poses: T_E_T of each capture, (4, 4) or its candidates (c, 4, 4), or None; None: none are known.
+    weights (k, 2n, 2n): what the errors of the pixels, counted in sigmas, are multiplied with; None: with nothing.
     """
 
     active: Array
@@ -30,6 +31,7 @@ class CaptureArrays:
     pixels: Array
     order_known: Mask | None = None
     board_poses: Sequence[ArrayLike | None] | None = None
+    weights: Array | None = None
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -49,6 +51,7 @@ class CaptureArrays:
             pixels=self.pixels[chosen],
             order_known=None if self.order_known is None else self.order_known[chosen],
             board_poses=None if poses is None else [pose for pose, kept in zip(poses, chosen, strict=True) if kept],
+            weights=None if self.weights is None else self.weights[chosen],
         )
 
     def turned(self, flipped: Mask) -> CaptureArrays:

@@ -81,7 +81,7 @@ class Sight:
 
 class Model:
     """Captures and knowns as arrays that no state changes. Arrivals are numbered in the order of their first capture;
-    an arrival's reading is the median of its captures'.
+    an arrival's reading is the median of its captures'. freedom (k,): numbers measured in each capture.
     """
 
     def __init__(self, data: CaptureArrays, knowns: Knowns, noise: Noise) -> None:
@@ -97,6 +97,10 @@ class Model:
         self.J_passive = in_flange(knowns.passive.jacobian(data.passive), self.T_P_F)
         self.seen: Mask = np.asarray(np.isfinite(data.pixels).all(axis=-1))
         self.pixels = np.where(self.seen[..., None], data.pixels, 0.0)
+        self.weights = data.weights
+        self.freedom = np.asarray(2.0 * self.seen.sum(axis=1))
+        if self.weights is not None:
+            self.freedom = np.minimum(self.freedom, np.linalg.matrix_rank(self.weights, hermitian=True))
 
     @property
     def arrivals(self) -> int:
@@ -107,14 +111,9 @@ class Model:
         return len(self.pixels)
 
     @property
-    def freedom(self) -> Array:
-        """(k,): numbers measured in each capture, two for each corner."""
-        return np.asarray(2.0 * self.seen.sum(axis=1))
-
-    @property
     def measurements(self) -> int:
-        """Numbers measured: two for each corner."""
-        return 2 * int(self.seen.sum())
+        """Numbers measured: two for each corner, six for a pose of the board."""
+        return int(self.freedom.sum())
 
     def state(self, T_P_A: Array, T_H_E: Array) -> State:
         """With both arms exactly where they were read."""
@@ -181,6 +180,9 @@ class Model:
         J = np.concatenate([-J_pixel, J_pixel @ skew(in_camera)], axis=-1)
         J = (np.where(seen[..., None, None], J, 0.0) / self.noise.pixel).reshape(len(T_E_T), -1, 6)
         r = (np.where(seen[..., None], found - pixels, 0.0) / self.noise.pixel).reshape(len(T_E_T), -1)
+        if self.weights is not None:
+            weights = self.weights if which is None else self.weights[which]
+            J, r = weights @ J, (weights @ r[..., None])[..., 0]
         J_T = np.swapaxes(J, 1, 2)
         # From the target on its flange to the camera: the passive arm moves T_P_E the other way.
         T_E_F = T_E_T @ inverse(self.knowns.T_F_T)
@@ -230,7 +232,10 @@ class Model:
         return T_E_P, T_E_P[self.arrival] @ moved(self.T_P_F, passive) @ self.knowns.T_F_T
 
     def _whitened(self, pixels: Array) -> Array:
-        return np.where(self.seen[..., None], pixels - self.pixels, 0.0) / self.noise.pixel
+        r = np.where(self.seen[..., None], pixels - self.pixels, 0.0) / self.noise.pixel
+        if self.weights is None:
+            return r
+        return np.asarray((self.weights @ r.reshape(self.captures, -1, 1)).reshape(r.shape))
 
     def _summed(self, per_capture: Array) -> Array:
         total = np.zeros((self.arrivals, *per_capture.shape[1:]))

@@ -11,10 +11,11 @@ from rich.console import Console, RenderableType
 from scipy.spatial.transform import Rotation
 
 from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Rejected
+from dualcal_hal.transforms import rotation_from_vector, transform
 from procedures.analysis import analyse
 from procedures.planning.ways import Leg
 from procedures.report import error_table, mismatch_table, outcome, plan_table, result_tables, way_table
-from tests.reference_cell import NOMINAL_T_H_E, NOMINAL_T_P_A, T_H_E
+from tests.reference_cell import NOMINAL_T_H_E, NOMINAL_T_P_A, T_H_E, T_P_A
 from tests.reference_run import TRUTH, captures, cell, plan, result
 
 FAR = [Leg("left", ((-3.0, -2.0, -2.1, -3.2, -2.1, -6.1),)), Leg("right", ((0.0,) * 6,))]
@@ -49,9 +50,9 @@ def test_the_papers_values_stand_beside_what_was_found_and_the_truth() -> None:
         ("dp_P_A_x     mm", 18.2, 18.2),
         ("dp_P_A_y     mm", 113.0, 113.0),
         ("dp_P_A_z     mm", 11.5, 11.5),
-        ("dp_H_E_x     mm", 7.3, 7.3),
-        ("dp_H_E_y     mm", -6.8, -6.8),
-        ("dp_H_E_z     mm", -0.57, -0.57),
+        ("dp_H_E_x*    mm", 7.3, 7.3),
+        ("dp_H_E_y*    mm", -6.8, -6.8),
+        ("dp_H_E_z*    mm", -0.57, -0.57),
     ):
         label, *unit = name.split()
         values = row(text, label)
@@ -66,14 +67,14 @@ def test_found_values_follow_from_the_transforms_found() -> None:
     dz = result().optical_axis - NOMINAL_T_H_E[:3, 2]
     dp_P_A = 1e3 * (result().T_P_A - NOMINAL_T_P_A)[:3, 3]
     dp_H_E = 1e3 * (result().T_H_E - NOMINAL_T_H_E)[:3, 3]
-    for name, vector, half_digit in (
-        ("w", w, 5e-5),
-        ("dz", dz, 5e-5),
-        ("dp_P_A", dp_P_A, 5e-3),
-        ("dp_H_E", dp_H_E, 5e-3),
+    for name, vector, half_digit, mark in (
+        ("w", w, 5e-5, ""),
+        ("dz", dz, 5e-5, ""),
+        ("dp_P_A", dp_P_A, 5e-3, ""),
+        ("dp_H_E", dp_H_E, 5e-3, "*"),
     ):
         for letter, expected in zip("xyz", vector, strict=True):
-            found = [value for value in row(text, f"{name}_{letter}") if value != "mm"][1]
+            found = [value for value in row(text, f"{name}_{letter}{mark}") if value != "mm"][1]
             assert float(found) == pytest.approx(expected, abs=1.001 * half_digit)
 
 
@@ -86,6 +87,13 @@ def test_the_shift_along_the_axis_is_marked_as_nominal_by_construction() -> None
     assert float(truth) == pytest.approx(shift, abs=0.006)
     assert shift < -1
     assert "* Not observable, nominal by construction" in text
+
+
+def test_the_roll_is_marked_as_nominal_by_construction_and_the_paper_says_nothing_of_it() -> None:
+    rolled = {T_P_A_NAME: T_P_A, T_H_E_NAME: T_H_E @ transform(rotation_from_vector([0, 0, np.radians(3)]), [0, 0, 0])}
+    text = printed(error_table(cell(), result(), rolled))
+    assert row(text, "roll about the axis*") == ["deg", "-", "0.0000", "3.0000", "-3.0000"]
+    assert "the camera's depth and roll" in text
 
 
 def test_a_shift_that_was_observed_is_not_marked() -> None:
@@ -176,6 +184,27 @@ def test_the_verdict_comes_with_its_reasons_warnings_and_what_was_left_out() -> 
         "  weak conditioning 0.03",
         "  left out calibration/02/1: not aligned",
     ]
+
+
+def test_captures_left_out_for_one_reason_share_a_line_and_many_reasons_are_counted() -> None:
+    of_one = [Rejected(f"calibration/02/{i}", "the arm stood elsewhere") for i in range(7)]
+    others = [Rejected(f"calibration/03/{i}", f"{i + 5} sigma off") for i in range(6)]
+    text = printed(outcome(replace(result(), captures_rejected=(*of_one, *others))))
+    told = " ".join(text.split())
+    assert "left out calibration/02/0, calibration/02/1, calibration/02/2, calibration/02/3 and 3 more: the arm" in told
+    assert "left out calibration/03/2: 7 sigma off" in told
+    assert "8 sigma off" not in told
+    assert "left out 3 more captures; result.json has them all" in told
+
+
+def test_a_reason_that_is_told_with_its_captures_is_not_told_twice() -> None:
+    rejected = Rejected("calibration/02/1", "not aligned")
+    given = replace(
+        result(),
+        reasons=("good", "1 captures rejected, the first calibration/02/1: not aligned"),
+        captures_rejected=(rejected,),
+    )
+    assert printed(outcome(given)).splitlines()[1:] == ["  good", "  left out calibration/02/1: not aligned"]
 
 
 def test_unverified_results_have_no_mismatch_table() -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualcal_hal.config import CellConfig, NominalConfig
-from dualcal_hal.transforms import Array
+from dualcal_hal.transforms import Array, rotation_from_vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,17 +15,24 @@ class NominalErrors:
     """Found minus nominal.
 
     w: the rotation error of ``R_A_P = R_A_P_nominal dR(w)``, its axis times the sine of its angle (3,);
-    dz: optical axis in the active flange, a difference of unit vectors (3,); dp_P_A, dp_H_E: m (3,).
+    dz: optical axis in the active flange, a difference of unit vectors (3,); dp_P_A, dp_H_E: m (3,);
+    roll: of the camera about its optical axis, rad, beyond the smallest rotation that takes the nominal axis to it.
+    NaN where nothing is said of it.
     """
 
     w: Array
     dz: Array
     dp_P_A: Array
     dp_H_E: Array
+    roll: float
 
     def __sub__(self, other: NominalErrors) -> NominalErrors:
         return NominalErrors(
-            self.w - other.w, self.dz - other.dz, self.dp_P_A - other.dp_P_A, self.dp_H_E - other.dp_H_E
+            w=self.w - other.w,
+            dz=self.dz - other.dz,
+            dp_P_A=self.dp_P_A - other.dp_P_A,
+            dp_H_E=self.dp_H_E - other.dp_H_E,
+            roll=self.roll - other.roll,
         )
 
 
@@ -38,7 +45,17 @@ def nominal_errors(T_P_A: Array, T_H_E: Array, nominal: NominalConfig) -> Nomina
         dz=T_H_E[:3, 2] - nominal.T_H_E[:3, 2],
         dp_P_A=T_P_A[:3, 3] - nominal.T_P_A[:3, 3],
         dp_H_E=T_H_E[:3, 3] - nominal.T_H_E[:3, 3],
+        roll=_roll(T_H_E[:3, :3], nominal.T_H_E[:3, :3]),
     )
+
+
+def _roll(R: Array, nominal: Array) -> float:
+    about = np.cross(nominal[:, 2], R[:, 2])
+    sine = float(np.linalg.norm(about))
+    angle = np.arctan2(sine, nominal[:, 2] @ R[:, 2])
+    least = rotation_from_vector(about * (angle / sine if sine > 0 else 1.0))
+    x, y = (least @ nominal)[:, :2].T @ R[:, 0]
+    return float(np.arctan2(y, x))
 
 
 PAPER_ERRORS = NominalErrors(
@@ -46,6 +63,7 @@ PAPER_ERRORS = NominalErrors(
     dz=np.array([-0.0978, -0.0076, -0.0001]),
     dp_P_A=np.array([18.2, 113.0, 11.5]) / 1000,
     dp_H_E=np.array([7.3, -6.8, -0.57]) / 1000,
+    roll=np.nan,
 )
 """Tables 3 and 4; dz as printed, which the paper adds to the nominal axis before it normalises the sum."""
 

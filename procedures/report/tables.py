@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -11,12 +12,14 @@ from rich.table import Table
 from rich.text import Text
 
 from dualcal_hal.config import CellConfig
-from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Mismatch, Result, TruthError
+from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Mismatch, Rejected, Result, TruthError
 from dualcal_hal.transforms import Array
 from procedures.planning.choice import LEAST_SPREAD
 from procedures.planning.model import Posture
 from procedures.planning.plan import Plan, PlannedConstraint
 from procedures.planning.ways import Leg
+from procedures.report.accuracy_tables import accuracy_tables, advice
+from procedures.report.kept import Kept
 from procedures.report.nominal_errors import (
     PAPER_ERRORS,
     PAPER_MISMATCH_MM,
@@ -25,13 +28,27 @@ from procedures.report.nominal_errors import (
     nominal_errors,
 )
 
+MOST_LEFT_OUT = 4
+"""Reasons for which captures were left out that are shown, each with its captures."""
+
 _NONE = "-"
 _STYLES = {"ok": "bold green", "fail": "bold red"}
+_KEPT = "*"  # beside what the paper's method leaves as it was given, wholly or in part
+_WIDTH = 78
+_MOST_IDS = 4
 
 
 def result_tables(cell: CellConfig, result: Result, truth: Mapping[str, Array] | None = None) -> Group:
-    """All there is to say about a result; truth: both transforms (4, 4) in m by their names, where they are known."""
-    parts: list[RenderableType] = [error_table(cell, result, truth), ""]
+    """What there is to say about a result; truth: both transforms (4, 4) in m by their names, where they are known.
+
+    The outcome comes last: it is what the screen stays at.
+    """
+    parts: list[RenderableType] = []
+    accuracy = result.accuracy
+    if accuracy is not None:
+        parts += [accuracy_tables(result, accuracy), ""]
+    if accuracy is None or truth is not None or is_papers_cell(cell):
+        parts += [error_table(cell, result, truth), ""]
     if result.mismatch_before is not None and result.mismatch_after is not None:
         parts.append(mismatch_table(cell, result.mismatch_before, result.mismatch_after))
     return Group(*parts, outcome(result))
@@ -50,10 +67,14 @@ def error_table(cell: CellConfig, result: Result, truth: Mapping[str, Array] | N
         columns["found - truth"] = columns["found"] - columns["truth"]
 
     table = _table("Errors of the nominal transforms (Tables 3 and 4)", "error", "unit", *columns)
-    for name, unit, values in _error_rows(columns):
+    kept = Kept.of(result)
+    shift, roll = (_KEPT if is_kept else "" for is_kept in (kept.shift, kept.roll))
+    for name, unit, values in _error_rows(columns, shift):
         table.add_row(name, unit, *values)
     along = [f"{1e3 * errors.dp_H_E @ result.optical_axis:z.2f}" for errors in columns.values()]
-    table.add_row("dp_H_E along the axis" + ("*" if _shift_is_kept(result) else ""), "mm", *along)
+    table.add_row(f"dp_H_E along the axis{shift}", "mm", *along)
+    rolls = [_NONE if np.isnan(errors.roll) else f"{np.degrees(errors.roll):z.4f}" for errors in columns.values()]
+    table.add_row(f"roll about the axis{roll}", "deg", *rolls)
     if result.truth_error is not None:
         table.add_section()
         for name, unit, value in _truth_rows(result.truth_error):
@@ -76,13 +97,33 @@ def mismatch_table(cell: CellConfig, before: Mismatch, after: Mismatch) -> Table
 
 
 def outcome(result: Result) -> Text:
-    """The verdict with its reasons and warnings, and the captures that were left out."""
+    """The verdict with its reasons and warnings, what is to be done, and the captures that were left out."""
     text = Text.assemble("Verdict: ", (result.verdict, _STYLES.get(result.verdict, "bold yellow")))
-    for reason in result.reasons:
-        text.append(f"\n  {reason}")
-    for rejected in result.captures_rejected:
-        text.append(f"\n  left out {rejected.id}: {rejected.reason}")
+    for line in (*_reasons(result), *_left_out(result.captures_rejected)):
+        text.append("\n" + textwrap.fill(line, _WIDTH, initial_indent="  ", subsequent_indent="    "))
     return text
+
+
+def _reasons(result: Result) -> Iterator[str]:
+    told_below = tuple(f"{rejected.id}: {rejected.reason}" for rejected in result.captures_rejected)
+    if result.verification is not None:
+        told_below += result.verification.look_at
+    yield from (reason for reason in result.reasons if not reason.endswith(told_below))
+    if result.accuracy is not None:
+        yield from advice(result.accuracy, result.verification)
+
+
+def _left_out(rejected: Sequence[Rejected]) -> Iterator[str]:
+    """A line for each reason, with its captures."""
+    captures: dict[str, list[str]] = {}
+    for one in rejected:
+        captures.setdefault(one.reason, []).append(one.id)
+    for reason, ids in list(captures.items())[:MOST_LEFT_OUT]:
+        more = f" and {len(ids) - _MOST_IDS} more" if len(ids) > _MOST_IDS else ""
+        yield f"left out {', '.join(ids[:_MOST_IDS])}{more}: {reason}"
+    left = sum(len(ids) for ids in list(captures.values())[MOST_LEFT_OUT:])
+    if left:
+        yield f"left out {left} more captures; result.json has them all with their reasons"
 
 
 def plan_table(plan: Plan) -> Table:
@@ -137,17 +178,17 @@ def _table(title: str, *headers: str) -> Table:
 # -- errors ------------------------------------------------------------------------------------------------------------
 
 
-def _error_rows(columns: Mapping[str, NominalErrors]) -> Iterator[tuple[str, str, list[str]]]:
-    """Name, unit, and the value for each column."""
-    for name, unit, scale, digits in (
-        ("w", "", 1.0, 4),
-        ("dz", "", 1.0, 4),
-        ("dp_P_A", "mm", 1e3, 2),
-        ("dp_H_E", "mm", 1e3, 2),
+def _error_rows(columns: Mapping[str, NominalErrors], mark: str) -> Iterator[tuple[str, str, list[str]]]:
+    """Name, unit, and the value for each column; mark: of the camera's position."""
+    for name, unit, scale, digits, shown in (
+        ("w", "", 1.0, 4, ""),
+        ("dz", "", 1.0, 4, ""),
+        ("dp_P_A", "mm", 1e3, 2, ""),
+        ("dp_H_E", "mm", 1e3, 2, mark),
     ):
         for i, letter in enumerate("xyz"):
             values = [scale * getattr(errors, name)[i] for errors in columns.values()]
-            yield f"{name}_{letter}", unit, [f"{value:z.{digits}f}" for value in values]
+            yield f"{name}_{letter}{shown}", unit, [f"{value:z.{digits}f}" for value in values]
 
 
 def _truth_rows(error: TruthError) -> Iterator[tuple[str, str, str]]:
@@ -155,11 +196,10 @@ def _truth_rows(error: TruthError) -> Iterator[tuple[str, str, str]]:
     yield "T_P_A translation", "mm", f"{1e3 * error.base_translation:.3f}"
     yield "optical axis direction", "deg", f"{np.degrees(error.camera_axis):.4f}"
     yield "camera across the axis", "mm", f"{1e3 * error.camera_sideways:.3f}"
-
-
-def _shift_is_kept(result: Result) -> bool:
-    """Whether the camera's shift along its axis is the nominal one by construction."""
-    return any(entry.of == T_H_E_NAME and any(entry.direction[:3]) for entry in result.unobservable)
+    if error.camera_rotation is not None:
+        yield "T_H_E rotation", "deg", f"{np.degrees(error.camera_rotation):.4f}"
+    if error.camera_translation is not None:
+        yield "T_H_E translation", "mm", f"{1e3 * error.camera_translation:.3f}"
 
 
 def _notes(cell: CellConfig, result: Result) -> Text:
@@ -169,8 +209,11 @@ def _notes(cell: CellConfig, result: Result) -> Text:
         axis = nominal + PAPER_ERRORS.dz
         x, y, z = axis / np.linalg.norm(axis) - nominal
         notes.append(f"The paper's dz is as printed; as a difference of unit vectors {x:.4f} {y:.4f} {z:.4f}.")
-    if _shift_is_kept(result):
-        notes.append("* Not observable, nominal by construction; it is part of dp_H_E x, y and z.")
+    kept = Kept.of(result)
+    if kept.words:
+        notes.append(f"{_KEPT} Not observable, nominal by construction: the camera's {kept.words}.")
+    if kept.shift:
+        notes.append("  The depth is a part of dp_H_E x, y and z.")
     return Text("\n".join(notes))
 
 

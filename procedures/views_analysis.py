@@ -55,9 +55,12 @@ class StatedNoise:
 
 @dataclass(frozen=True)
 class ViewsChoices:
-    """noise: None for what the views show; free_intrinsics: focal lengths, centre and distortion are estimated too."""
+    """estimate_noise: the sigmas are those that the views show; of what is stated, flange poses keep the ratio of both.
+    free_intrinsics: focal lengths, centre and distortion are estimated too. keep_all: no view is dropped.
+    """
 
-    noise: StatedNoise | None = None
+    noise: StatedNoise = StatedNoise(PIXEL, TRANSLATION, ROTATION)
+    estimate_noise: bool = True
     free_intrinsics: bool = False
     keep_all: bool = False
 
@@ -77,6 +80,11 @@ class Seen:
     @property
     def corners(self) -> int:
         return sum(int(found.seen.sum()) for found in self.outcomes if isinstance(found, Detection))
+
+    @property
+    def with_target(self) -> int:
+        """Images that show the target."""
+        return sum(isinstance(found, Detection) for found in self.outcomes)
 
 
 def look_at(file: ViewsFile) -> Seen:
@@ -119,7 +127,7 @@ def _read_image(view: View) -> Image:
 
 def analyse_views(file: ViewsFile, seen: Seen, choices: ViewsChoices) -> ViewsResult:
     """Estimate from what was found in the images; DegenerateCaptures for views that do not determine the transforms."""
-    noise = choices.noise or StatedNoise(PIXEL, TRANSLATION, ROTATION)
+    noise = choices.noise
     views = _views(file, seen, noise)
     try:
         placement = _placement(file, views, noise)
@@ -128,11 +136,11 @@ def analyse_views(file: ViewsFile, seen: Seen, choices: ViewsChoices) -> ViewsRe
             Placement(placement.name),
             noise.pixel,
             keep_all=choices.keep_all,
-            estimate_noise=choices.noise is None,
+            estimate_noise=choices.estimate_noise,
             inexact=choices.inexact,
         )
         fits = {WITH_ERRORS: likely}
-        if choices.noise is None:
+        if choices.estimate_noise:
             fits[AS_READ] = fit_as_read(views, likely, choices.inexact)
         left_out = {name: leave_one_out(views, fit, choices.inexact) for name, fit in fits.items()}
         broken_down = break_down(views, likely)
@@ -144,7 +152,7 @@ def analyse_views(file: ViewsFile, seen: Seen, choices: ViewsChoices) -> ViewsRe
         best = AS_READ
     result = _result(file, seen, choices, placement, fits[best], left_out[best], broken_down)
     result = replace(result, attempts=attempts)
-    verdict, reasons = verdict_of(result, likely.scale if choices.noise is not None else 1.0)
+    verdict, reasons = verdict_of(result, 1.0 if choices.estimate_noise else likely.scale)
     return replace(result, verdict=verdict, reasons=reasons)
 
 
@@ -211,7 +219,7 @@ def _result(
     broken_down: Breakdown,
 ) -> ViewsResult:
     found = fit.found
-    lever = TRANSLATION / ROTATION if choices.noise is None else choices.noise.translation / choices.noise.rotation
+    lever = choices.noise.translation / choices.noise.rotation
     row, column = divmod(file.board.feature, file.board.columns)
     given = replace(file.intrinsics, size=seen.size)
     return ViewsResult(

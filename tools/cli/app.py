@@ -115,7 +115,8 @@ def estimate(
     captures: Annotated[
         Path,
         typer.Argument(
-            metavar="CAPTURES|SESSION|TRIPLES", help="captures.json, a session folder, or pose triples (JSON or CSV)."
+            metavar="CAPTURES|SESSION|TRIPLES|VIEWS",
+            help="captures.json, a session folder, pose triples (JSON, CSV), or images with flange poses (JSON).",
         ),
     ],
     cell: Annotated[Path | None, typer.Option(help="The cell file; a session brings its own.")] = None,
@@ -145,13 +146,23 @@ def estimate(
     sigma_c: Annotated[
         str | None, typer.Option(metavar="MM,DEG", help="Triples: sigma per axis of C, the passive flange in its base.")
     ] = None,
+    sigma_flange: Annotated[
+        str | None, typer.Option(metavar="MM,DEG", help="Views: sigma per axis of a flange pose, else it is found.")
+    ] = None,
+    sigma_pixel: Annotated[
+        float | None, typer.Option(metavar="PX", help="Views: sigma per axis of a corner, else it is found.")
+    ] = None,
     json: Json = False,
 ) -> None:
-    """Estimate and verify from captures, without any device; or from pose triples of AXB = YCZ, without a cell.
+    """Estimate and verify from captures, without any device; or without a cell from pose triples or photographs.
 
-    How exact the poses of triples are stands in their file, or is given with --sigma-a, --sigma-b and --sigma-c.
+    How exact the poses of triples of AXB = YCZ are stands in their file, or is given with --sigma-a, -b and -c.
 
-    Exit code 0 once there is a result, 2 for a call, cell file, captures or triples that cannot be used.
+    How exact the flange poses of photographs are is found in them, or is stated with --sigma-flange.
+
+    With --out pictures of what is off in photographs are written beside their result.
+
+    Exit code 0 once there is a result, 2 for a call, cell file, captures, triples or views that cannot be used.
     """
     with ended_in_order():
         from tools.cli.estimate import EstimateOptions, estimate_captures
@@ -170,6 +181,8 @@ def estimate(
                 free=tuple(free or ()),
                 json=json,
                 sigmas=sigmas,
+                sigma_flange=sigma_flange,
+                sigma_pixel=sigma_pixel,
             )
         )
 

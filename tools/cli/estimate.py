@@ -23,6 +23,7 @@ from tools.cli.show import show_result
 from tools.cli.terminal import Screen
 from tools.cli.triples import TriplesOptions, estimate_from_triples, holds_triples
 from tools.cli.truth import simulated_truth
+from tools.cli.views import ViewsOptions, estimate_from_views, holds_views
 
 SOURCES = ("captures.json", "cell.yaml", "journal.jsonl", "plan.json")
 """Files of a session that no result may replace."""
@@ -43,17 +44,16 @@ class EstimateOptions:
     free: tuple[str, ...]
     json: bool
     sigmas: Mapping[str, str | None]  # of pose triples alone, by A, B, C
+    sigma_flange: str | None  # of views alone
+    sigma_pixel: float | None
 
 
 def estimate_captures(options: EstimateOptions) -> None:
-    """Analyse captures, or pose triples, from anywhere; print the result and write it where asked."""
+    """Analyse captures, pose triples or views from anywhere; print the result and write it where asked."""
     if not options.captures.exists():
         raise UsageError(f"{options.captures}: does not exist")
     _check_out(options)
-    triples = holds_triples(options.captures)
-    _refuse_unfit(options, triples=triples)
-    if triples:
-        estimate_from_triples(TriplesOptions(options.captures, options.sigmas, options.out, options.json))
+    if _estimated_without_cell(options):
         return
     file = load_cell(_cell_path(options), meshes=False, backends=False)
     captures, unfinished = _captures(options.captures, file)
@@ -85,22 +85,52 @@ def estimate_captures(options: EstimateOptions) -> None:
         console.print("Not written to a file; --out FILE does that.")
 
 
-def _refuse_unfit(options: EstimateOptions, *, triples: bool) -> None:
-    """Options that say something of captures where there are triples, or the other way round."""
-    of_captures = {
-        "--cell": options.cell is not None,
-        "--method": options.method is not None,
-        "--truth": options.truth is not None,
-        "--redetect": options.redetect,
-        "--noise": options.noise is not None,
-        "--keep-all": options.keep_all,
-        "--free": bool(options.free),
+def _estimated_without_cell(options: EstimateOptions) -> bool:
+    """Whether there were pose triples or views."""
+    if holds_triples(options.captures):
+        _refuse_unfit(options, "pose triples")
+        estimate_from_triples(TriplesOptions(options.captures, options.sigmas, options.out, options.json))
+        return True
+    if holds_views(options.captures):
+        _refuse_unfit(options, "views")
+        estimate_from_views(_of_views(options))
+        return True
+    _refuse_unfit(options, "captures")
+    return False
+
+
+def _refuse_unfit(options: EstimateOptions, here: str) -> None:
+    """Options that say something of what the file does not have; here: what it has."""
+    captures, triples, views, either = ("captures",), ("pose triples",), ("views",), ("captures", "views")
+    given = {
+        "--cell": (options.cell is not None, captures),
+        "--method": (options.method is not None, captures),
+        "--truth": (options.truth is not None, captures),
+        "--redetect": (options.redetect, captures),
+        "--noise": (options.noise is not None, either),
+        "--keep-all": (options.keep_all, either),
+        "--free": (bool(options.free), either),
+        **{f"--sigma-{name.lower()}": (sigma is not None, triples) for name, sigma in options.sigmas.items()},
+        "--sigma-flange": (options.sigma_flange is not None, views),
+        "--sigma-pixel": (options.sigma_pixel is not None, views),
     }
-    of_triples = {f"--sigma-{name.lower()}": sigma is not None for name, sigma in options.sigmas.items()}
-    unfit = ", ".join(name for name, given in (of_captures if triples else of_triples).items() if given)
+    unfit = {name: of for name, (is_given, of) in given.items() if is_given and here not in of}
     if unfit:
-        here, there = ("pose triples", "captures") if triples else ("captures", "pose triples")
-        raise UsageError(f"{options.captures}: has {here}; leave out what is for {there}: {unfit}")
+        there = " and ".join(dict.fromkeys(kind for of in unfit.values() for kind in of))
+        raise UsageError(f"{options.captures}: has {here}; leave out what is for {there}: {', '.join(unfit)}")
+
+
+def _of_views(options: EstimateOptions) -> ViewsOptions:
+    return ViewsOptions(
+        options.captures,
+        options.noise,
+        options.sigma_flange,
+        options.sigma_pixel,
+        options.keep_all,
+        options.free,
+        options.out,
+        options.json,
+    )
 
 
 def _choices(options: EstimateOptions) -> Choices | None:

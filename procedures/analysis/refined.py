@@ -122,7 +122,8 @@ def _suspects(
     if looked_at is None or looked_at.fits:
         return ()
     used = [capture for capture, kept in zip(calibration, found.used, strict=True) if kept]
-    return next_suspects(found, arrays([*used, *verification], cell))
+    every = [*used, *verification]
+    return next_suspects(found, arrays(every, cell), [capture.id for capture in every])
 
 
 def _judge(

@@ -41,7 +41,8 @@ def aligned(cell: Cell, rng: np.random.Generator, noise: Noise, tolerance: float
     active = rng.normal(size=(model.arrivals, data.active.shape[1]))[model.arrival]
     by_active = np.einsum("kin,kn->ki", J @ at.towards_active[model.arrival], active)
     left = np.tile([_FIRST_MISS, -_FIRST_MISS], (len(data), 1))
-    passive, pixels = np.zeros(data.passive.shape), np.zeros(data.pixels.shape)
+    passive: Array = np.zeros_like(data.passive)
+    pixels: Array = np.zeros_like(data.pixels)
     waiting = np.arange(len(data))
     while len(waiting):
         passive[waiting] = rng.normal(size=(len(waiting), passive.shape[1]))

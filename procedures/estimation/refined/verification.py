@@ -75,7 +75,7 @@ def verify(result: Refined, captures: CaptureArrays, aligned: tuple[int, float] 
     0.26 each at a tolerance of two sigmas of b. It costs nothing of what is wrong with the estimate: the
     alignment brings the measured point to the principal point whatever the estimate says of it.
     """
-    captures = _in_order(result, captures)
+    captures = in_order(result, captures)
     model = Model(captures, result.knowns, result.noise)
     residuals, seen = model.residuals(model.state(result.T_P_A, result.T_H_E)), model.seen
     shown = np.where(seen[..., None], residuals * result.noise.pixel, np.nan)
@@ -179,8 +179,8 @@ def _without(gram: Array, kept: int) -> Array:
     return np.asarray(gram[..., :kept, :kept] - np.swapaxes(mixed, -1, -2) @ np.linalg.solve(inner, mixed))
 
 
-def _in_order(result: Refined, captures: CaptureArrays) -> CaptureArrays:
-    """With the corners of those of unknown order listed from the end from which they fit better."""
+def in_order(result: Refined, captures: CaptureArrays) -> CaptureArrays:
+    """Captures with the corners of those of unknown order listed from the end from which they fit better."""
     turned: Mask = ~captures.order
     if not turned.any():
         return captures

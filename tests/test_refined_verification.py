@@ -8,14 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from dualcal_hal.kinematics import random_joints
-from dualcal_hal.transforms import Array, inverse
+from dualcal_hal.transforms import Array
 from procedures.estimation.refined import refined, target_mount
 from procedures.estimation.refined.data import CaptureArrays
 from procedures.estimation.refined.model import Model
 from procedures.estimation.refined.suspects import next_suspects
 from procedures.estimation.refined.verification import Consistency, verify
-from tools.benchmarks.refined import LIMITS, NOISES, reference
+from tools.benchmarks.refined import NOISES, reference
 from tools.benchmarks.verification import (
     Check,
     Wrong,
@@ -176,13 +175,9 @@ class TestBadSets:
 
     def test_a_board_that_should_be_behind_the_camera_is_as_far_off_as_can_be(self) -> None:
         data = OTHER.noisy(np.random.default_rng(1), NOISE)
-        cell = reference()
-        T_P_E = cell.T_P_A @ cell.knowns.active.forward(data.active[2]) @ cell.T_H_E
-        anywhere = random_joints(np.random.default_rng(0), 300, *LIMITS.T)
-        depth = (inverse(T_P_E) @ cell.knowns.passive.forward(anywhere))[:, 2, 3]
-        data.passive[2] = anywhere[np.argmin(depth)]
+        data.active[:7, 0] += np.pi  # the camera looks the other way
         found = judged(data)
-        assert np.flatnonzero(np.isinf(found.captures)).tolist() == [2]
+        assert np.flatnonzero(np.isinf(found.captures)).tolist() == list(range(7))
         assert found.probability == 0
         assert not found.fits
 

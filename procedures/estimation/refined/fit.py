@@ -42,7 +42,7 @@ def minimise(model: Model, state: State, damping: float = 1e-4, most_steps: int 
             return Fit(state, at, False, step)
         tried = model.stepped(state, at, change)
         gain = at.cost - model.cost(tried)
-        if gain >= -1e-9 * at.cost:
+        if gain >= -1e-9 * (1 + at.cost):
             state, damping = tried, max(damping / 10, _LEAST_DAMPING)
             at = model.linearised(state)
             if gain < _SMALLEST_GAIN and damping < 1e-2:

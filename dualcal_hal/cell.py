@@ -22,6 +22,7 @@ from dualcal_hal.pace import FULL_PACE, REDUCED_SPEED, Pace
 from dualcal_hal.registry import backend_class
 from dualcal_hal.robot import Joints, Mode
 from dualcal_hal.session.log.recording import Recording
+from dualcal_hal.stand import Stand
 
 OPEN_TIMEOUT = 10.0
 """Seconds that a backend may take to open."""
@@ -152,7 +153,7 @@ class Cell:
         Returns the arms that were switched on. It passes by the recording, as it is no part of what a procedure does.
         """
         enabled = []
-        for name in (self._file.cell.active_name, self._file.cell.passive_name):
+        for name in self._file.cell.arms:
             robot = self._backends[self._file.cell.robots[name].backend].robot(name)
             if robot.read(ENABLE_TIMEOUT).mode is not Mode.READY:
                 robot.enable(ENABLE_TIMEOUT)
@@ -178,10 +179,14 @@ class Cell:
 
     def _arm(self, name: str, config: RobotConfig) -> Arm:
         limits = JointLimits.of(config)
+        home = tuple(map(float, config.home))
+        if not config.chain.joints:
+            stand = GuardedRobot(Stand(name, self.clock), limits, self.clock)
+            return Arm(stand, config.chain, limits, home, 0.0, 0.0, repeats_targets=True)
         device = self._backends[config.backend].robot(name)
         self._recording.watch(device)
         robot = GuardedRobot(self._recording.robot(device), limits, self.clock)
-        home, repeats = tuple(map(float, config.home)), self._backends[config.backend].repeats_targets
+        repeats = self._backends[config.backend].repeats_targets
         return Arm(robot, config.chain, limits, home, config.encoder_sigma, config.joint_sigma, repeats)
 
 

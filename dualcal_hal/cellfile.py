@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
+from pydantic.json_schema import models_json_schema
 from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
@@ -23,7 +24,18 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
-from dualcal_hal.config import CellConfig, CellDocument, Location, SimulationConfig, reference_problems
+from dualcal_hal.config import (
+    CellConfig,
+    CellDocument,
+    Location,
+    OneArmCell,
+    OneArmConfig,
+    OneArmDocument,
+    SimulationConfig,
+    is_of_one_arm,
+    one_arm_problems,
+    reference_problems,
+)
 from dualcal_hal.config.backends import BACKENDS_ARE_KNOWN
 from dualcal_hal.config.fixtures import FOLDER, MESHES_ARE_READ
 from dualcal_hal.errors import CellFileError, Problem
@@ -40,6 +52,11 @@ class CellFile:
     simulation: SimulationConfig | None
     text: str
     sha256: str
+
+    @property
+    def one_arm(self) -> OneArmConfig | None:
+        """What a file of a cell with one arm says, None for one of two."""
+        return self.cell.one_arm if isinstance(self.cell, OneArmCell) else None
 
 
 def load_cell(
@@ -82,7 +99,7 @@ def _load(
         raise CellFileError([problem for _, problem in sorted(problems, key=lambda p: p[0])] + refused)
     if overrides or instead is not None:
         text = _dumped(document)
-    return CellFile(checked.cell, checked.simulation, text, hashlib.sha256(text.encode()).hexdigest())
+    return CellFile(checked.cell, checked.world, text, hashlib.sha256(text.encode()).hexdigest())
 
 
 def _reach_through(document: CommentedMap, entry: Mapping[str, Any]) -> None:
@@ -148,8 +165,20 @@ def differences(used: str, given: str) -> str:
 
 
 def cell_schema() -> dict[str, Any]:
-    """The JSON Schema (2020-12) of a cell file, units and meanings in the descriptions."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **CellDocument.model_json_schema()}
+    """The JSON Schema (2020-12) of a cell file, units and meanings in the descriptions.
+
+    A file with one robot, which has no role, is of a cell of one arm.
+    """
+    documents, definitions = models_json_schema([(CellDocument, "validation"), (OneArmDocument, "validation")])
+    two, one = (documents[model, "validation"] for model in (CellDocument, OneArmDocument))
+    alone = {"maxProperties": 1, "additionalProperties": {"not": {"required": ["role"]}}}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **definitions,
+        "if": {"properties": {"robots": alone}},
+        "then": one,
+        "else": two,
+    }
 
 
 @dataclass(frozen=True)
@@ -161,13 +190,17 @@ class _Finding:
     at_key: bool = False
 
 
-def _checked(document: CommentedMap, context: Mapping[str, Any]) -> tuple[CellDocument | None, list[_Finding]]:
+def _checked(
+    document: CommentedMap, context: Mapping[str, Any]
+) -> tuple[CellDocument | OneArmDocument | None, list[_Finding]]:
     plain = _plain(document)
-    findings = [_Finding(*found) for found in reference_problems(plain)]
+    model: type[CellDocument | OneArmDocument] = OneArmDocument if is_of_one_arm(plain) else CellDocument
+    problems = one_arm_problems if model is OneArmDocument else reference_problems
+    findings = [_Finding(*found) for found in problems(plain)]
     try:
-        return CellDocument.model_validate(plain, context=dict(context)), findings
+        return model.model_validate(plain, context=dict(context)), findings
     except ValidationError as error:
-        return None, findings + _in_words(error)
+        return None, findings + _in_words(error, model)
 
 
 # The file and its line marks
@@ -440,15 +473,15 @@ _WORDS = {
 _WORDS_ALONE = {"missing", "too_short", "too_long", "value_error"}
 
 
-def _in_words(error: ValidationError) -> list[_Finding]:
-    findings = [_finding(details) for details in error.errors(include_url=False)]
+def _in_words(error: ValidationError, model: type[BaseModel]) -> list[_Finding]:
+    findings = [_finding(details, model) for details in error.errors(include_url=False)]
     return list(dict.fromkeys(findings))  # a list short of two entries says so once
 
 
-def _finding(details: ErrorDetails) -> _Finding:
+def _finding(details: ErrorDetails, model: type[BaseModel]) -> _Finding:
     location, kind = details["loc"], details["type"]
     if kind == "extra_forbidden":
-        return _Finding(location, "unknown key" + _suggestion(location), at_key=True)
+        return _Finding(location, "unknown key" + _suggestion(location, model), at_key=True)
     if kind == "missing" and isinstance(location[-1], int):
         return _Finding(location[:-1], f"has too few entries: {len(details['input'])}")
     if kind not in _WORDS:
@@ -467,14 +500,14 @@ def _seen(value: Any) -> str:
     return repr(value) if isinstance(value, str | int | float) else str(value)
 
 
-def _suggestion(location: Location) -> str:
-    near = difflib.get_close_matches(str(location[-1]), _known_keys(location[:-1]), n=1)
+def _suggestion(location: Location, model: type[BaseModel]) -> str:
+    near = difflib.get_close_matches(str(location[-1]), _known_keys(location[:-1], model), n=1)
     return f"; did you mean '{near[0]}'?" if near else ""
 
 
-def _known_keys(location: Location) -> list[str]:
+def _known_keys(location: Location, model: type[BaseModel]) -> list[str]:
     """The keys of the section at ``location``; none where the schema leaves them to a backend's options."""
-    schema = cell_schema()
+    schema = model.model_json_schema()
     section = schema
     for part in location:
         inner = section.get("properties", {}).get(part) or section.get("items")

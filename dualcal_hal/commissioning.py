@@ -76,7 +76,7 @@ class Commissioning:
         """As :meth:`of`."""
         self.path = _beside(cell_file)
         self._cell_file = cell_file
-        self._arms = tuple(file.cell.robots)
+        self._arms = tuple(file.cell.arms)
         self._arms_key, self._cell_key = arms_key(file.cell), cell_key(file.cell)
         self._content = self._read()
 
@@ -160,7 +160,7 @@ class Commissioning:
 
 def arms_key(cell: CellConfig) -> str:
     """Digest of what decides how the arms move: the robots and the backends that they are reached through."""
-    return _digest(_robots(cell, {robot.backend for robot in cell.robots.values()}))
+    return _digest(_robots(cell, {robot.backend for robot in cell.arms.values()}))
 
 
 def cell_key(cell: CellConfig) -> str:
@@ -172,7 +172,7 @@ def cell_key(cell: CellConfig) -> str:
 def _robots(cell: CellConfig, backends: set[str]) -> dict[str, Any]:
     reached = {name: cell.backends[name] for name in backends}
     return {
-        "robots": {name: robot.model_dump(mode="json") for name, robot in cell.robots.items()},
+        "robots": {name: robot.model_dump(mode="json") for name, robot in cell.arms.items()},
         "backends": {
             name: {"type": entry.type, "options": entry.checked.model_dump(mode="json")}
             for name, entry in reached.items()

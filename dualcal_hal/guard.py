@@ -185,7 +185,7 @@ class CellGuard:
         if self._watched:
             # The watch would stop the motion at once: better not to begin it.
             other.require_ready(state, "move the other arm")
-        if other.moving or max(map(abs, state.velocities)) > STANDSTILL:
+        if other.moving or max(map(abs, state.velocities), default=0.0) > STANDSTILL:
             raise CommandRefused(other.name, "move the other arm", "this one is moving", "wait until it has settled")
         return state
 

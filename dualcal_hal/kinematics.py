@@ -36,7 +36,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Chain:
-    """An arm's calibrated kinematics: one row a joint, base to flange."""
+    """An arm's calibrated kinematics: one row a joint, base to flange. Of a stand there is none: both are one frame."""
 
     rows: tuple[Row, ...]
 
@@ -46,7 +46,7 @@ class Chain:
 
     @cached_property
     def _after_joint(self) -> Array:
-        return np.stack([row.after_joint() for row in self.rows])
+        return np.array([row.after_joint() for row in self.rows]).reshape(-1, 4, 4)
 
     @cached_property
     def _theta(self) -> Array:
@@ -57,7 +57,7 @@ class Chain:
         q = np.asarray(q, dtype=float)
         if q.shape[-1] != self.joints:
             raise ValueError(f"expected {self.joints} joint angles, got {q.shape[-1]}")
-        angles = (q + self._theta).reshape(-1, self.joints)
+        angles = (q + self._theta).reshape(int(np.prod(q.shape[:-1])), self.joints)
         cosine, sine = np.cos(angles)[:, :, None], np.sin(angles)[:, :, None]
         after = self._after_joint
         rows = np.empty((len(angles), self.joints, 4, 4))

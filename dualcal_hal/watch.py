@@ -120,7 +120,7 @@ class Watch:
             return error
 
     def _look(self) -> DeviceError | None:
-        for robot in (self._moving, self._other):
+        for robot in (self._moving, self._other) if self._other.joints else (self._moving,):
             error = self._feedback[robot.name].wrong(robot.name, self._clock.now())
             if error is not None:
                 return error
@@ -149,9 +149,9 @@ class Watch:
         return self._failed(f"it moves at {speed * 1e3:.0f} mm/s, and {fastest * 1e3:.0f} mm/s is the most it may")
 
     def _too_close(self, q: Array, other: RobotState | None) -> DeviceError | None:
-        if other is None:
+        if other is None and self._other.joints:  # a stand tells nothing, and stands
             return None
-        clearance = self._bounds.clearance(q, np.array(other.positions))
+        clearance = self._bounds.clearance(q, np.array(() if other is None else other.positions))
         if clearance >= self._bounds.least:
             return None
         return self._failed(f"clearance may be down to {clearance * 1e3:.1f} mm, less than anywhere on its path")

@@ -523,7 +523,7 @@ def _view_from(record: dict[str, Any] | None) -> View | None:
         return None
     fields = Fields(record, "the view")
     corners = corners_from_record(fields.any("corners_px"))
-    return View(fields.finites("active_rad"), fields.finites("passive_rad"), corners)
+    return View(fields.joints("active_rad"), fields.joints("passive_rad"), corners)
 
 
 def _require_view(view: View | None, shape: CellShape) -> None:

@@ -267,7 +267,7 @@ class Engine:
         after = [arm.robot.read(READ_TIMEOUT) for arm in arms]
         joints = []
         for arm, first, last in zip(arms, before, after, strict=True):
-            moved = float(np.max(np.abs(np.subtract(last.positions, first.positions))))
+            moved = float(np.max(np.abs(np.subtract(last.positions, first.positions)), initial=0.0))
             if moved > _reading_noise(arm.encoder_sigma):
                 raise ArmMoved(
                     arm.robot.name,

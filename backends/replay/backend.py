@@ -59,7 +59,7 @@ class ReplayBackend(Backend):
         self._timeline: Timeline | None = None
         self._robots = {
             arm: ReplayedRobot(arm, config.chain.joints, self._clock, self._opened)
-            for arm, config in cell.cell.robots.items()
+            for arm, config in cell.cell.arms.items()
         }
         self._camera = ReplayedCamera(CAMERA, self._opened)
 
@@ -133,7 +133,7 @@ def _result(work: Worked) -> Any:
 
 
 def _require_whole_cell(name: str, cell: CellFile) -> None:
-    devices = {f"robots.{arm}.backend": config.backend for arm, config in cell.cell.robots.items()}
+    devices = {f"robots.{arm}.backend": config.backend for arm, config in cell.cell.arms.items()}
     devices["camera.backend"] = cell.cell.camera.backend
     problems = [
         Problem(where, f"is '{backend}': the replay '{name}' makes its own time and plays back the whole cell")

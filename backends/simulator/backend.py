@@ -52,7 +52,7 @@ class SimulatorBackend(Backend):
         self._clock = VirtualClock()
         self._open: Sight | None = None
         self._left: CellLeft | None = None
-        robots = cell.cell.robots.items()
+        robots = cell.cell.arms.items()
         self._robots = {arm: SimulatedRobot(arm, config, self._opened_world) for arm, config in robots}
         self._camera = SimulatedCamera(CAMERA, self._opened, self._simulation.errors.motion_blur.exposure)
 
@@ -118,7 +118,7 @@ class SimulatorBackend(Backend):
 
 def _simulation(name: str, cell: CellFile) -> SimulationConfig:
     """The cell's ``simulation`` section, once the cell is one that this backend can simulate."""
-    devices = {f"robots.{arm}.backend": config.backend for arm, config in cell.cell.robots.items()}
+    devices = {f"robots.{arm}.backend": config.backend for arm, config in cell.cell.arms.items()}
     devices["camera.backend"] = cell.cell.camera.backend
     problems = [
         Problem(where, f"is '{backend}': the simulator '{name}' simulates the whole cell, not a part of it")

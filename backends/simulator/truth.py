@@ -32,11 +32,11 @@ class Truth:
         mounted = displacement(directions(seed, "target_mount"), mount.translation, mount.rotation)
         self.T_P_A: Array = simulation.truth.T_P_A
         self.T_H_E: Array = simulation.truth.T_H_E
-        self.T_F_T: Array = cell.passive.target_mount_transform @ mounted
+        self.T_F_T: Array = simulation.truth.target_mount(cell) @ mounted
         known = simulation.truth.chains(cell)
         self.chains = {name: true_chain(name, chain, errors, seed) for name, chain in known.items()}
         self._joints = {
-            name: JointErrors(name, cell.robots[name], chain, errors, seed) for name, chain in self.chains.items()
+            name: JointErrors(name, robot, self.chains[name], errors, seed) for name, robot in cell.arms.items()
         }
 
     def approach(self, before: Approach, stretches: Iterable[Array], end: float) -> Approach:
@@ -47,6 +47,8 @@ class Truth:
 
     def link_angles(self, arm: str, read: Array, approach: Approach, when: float) -> Array:
         """(n,) rad at which the arm's links stand where ideal encoders read ``read`` (n,) rad."""
+        if arm not in self._joints:  # a stand, which has none
+            return read
         return read + self._joints[arm].deviation(read, approach, when)
 
     def T_P_E(self, q_a: Array, when: float) -> Array:

@@ -44,7 +44,8 @@ class CameraConfig(Section):
     backend: str
     """The entry under backends that grabs its frames."""
     mount: str
-    """The arm that carries it: the active one."""
+    """The arm that carries it: the active one. In a cell of one arm that arm, or fixed: it watches a target on the
+    arm."""
     matrix: Annotated[Matrix3, AfterValidator(_camera_matrix)]
     """[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], px; pixel centres are integers."""
     distortion: tuple[Number, Number, Number, Number, Number]

@@ -50,15 +50,13 @@ class MeshConfig(Section):
     """Metres that a unit of the file stands for."""
 
 
-class FixtureConfig(Section):
-    """A solid that stands in one base's frame: one of `box_mm`, `cylinder_mm`, `plane`, `mesh`."""
+class SolidConfig(Section):
+    """A solid that stands in the base's frame: one of `box_mm`, `cylinder_mm`, `plane`, `mesh`."""
 
     model_config = ConfigDict(
         json_schema_extra={"oneOf": [{"required": [shape]} for shape in ("box_mm", "cylinder_mm", "plane", "mesh")]}
     )
 
-    base: Annotated[Literal["active_base", "passive_base"], Field(alias="in")]
-    """The base in whose frame it stands."""
     at: TransformConfig
     """The solid's frame in the base's; boxes and cylinders have their middle in its origin."""
     box_mm: tuple[Positive, Positive, Positive] | None = None
@@ -91,3 +89,10 @@ class FixtureConfig(Section):
         if self.mesh is not None:
             return Mesh(read_mesh(Path(self.mesh.file), self.mesh.scale))
         return HalfSpace()
+
+
+class FixtureConfig(SolidConfig):
+    """A solid that stands in one base's frame: one of `box_mm`, `cylinder_mm`, `plane`, `mesh`."""
+
+    base: Annotated[Literal["active_base", "passive_base"], Field(alias="in")]
+    """The base in whose frame it stands."""

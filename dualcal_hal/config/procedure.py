@@ -99,6 +99,11 @@ def _above_zero(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
+Looks = Annotated[Natural, AfterValidator(_none_or_three)]
+Distances = Annotated[Range, AfterValidator(_above_zero)]
+Tilt = Annotated[Number, Field(gt=0, lt=90)]
+
+
 class StandOffConfig(Section):
     """Joint angles of both arms for the first look, one entry a joint."""
 
@@ -130,13 +135,13 @@ class ProcedureConfig(Section):
     """How many directions of the optical axis."""
     positions: AtLeast1
     """How many positions of the feature point on each axis; method paper needs 3."""
-    first_looks: Annotated[Natural, AfterValidator(_none_or_three)] = 5
+    first_looks: Looks = 5
     """How many images to plan from, at least 3; 0 plans from the nominal transforms, on simulated cells only."""
     stand_off: StandOffConfig | None = None
     """Where the first look is taken from; found where left out."""
-    distance_mm: Annotated[Range, AfterValidator(_above_zero)]
+    distance_mm: Distances
     """Smallest and largest distance between camera and feature point, mm."""
-    tilt_max_deg: Annotated[Number, Field(gt=0, lt=90)]
+    tilt_max_deg: Tilt
     """Largest angle between the target's normal and the optical axis, degrees."""
     tolerance_px: Tolerance
     """Largest offset of an aligned feature point in each axis, px; auto follows the scatter of arrivals."""

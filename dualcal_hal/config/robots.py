@@ -91,13 +91,11 @@ class KinematicsConfig(Section):
         return Chain(tuple(row.row for row in self.dh))
 
 
-class RobotConfig(Section):
-    """One arm. Lists have one entry a joint."""
+class ArmConfig(Section):
+    """The arm of a cell that has one. Lists have one entry a joint."""
 
     backend: str
     """The entry under backends that moves it."""
-    role: Literal["active", "passive"]
-    """The active arm carries the camera, the passive arm the target."""
     kinematics: KinematicsConfig
     """Calibrated before; taken as true by the method."""
     limits_deg: tuple[Range, ...]
@@ -118,10 +116,6 @@ class RobotConfig(Section):
     """The maker's repeatability, mm; only warned with."""
     link_radius_mm: tuple[Positive, ...] | None = None
     """Radius of the capsule about each link, mm; where left out 55 for the first three and 45 for the wrist's."""
-    target_mount: TransformConfig | None = Field(default=None, validate_default=True)
-    """Target in the passive flange; the passive arm's alone."""
-    target_mount_sigma: TransformSigma | None = None
-    """How exact target_mount is; exact where left out."""
 
     @field_validator(
         "limits_deg", "limit_margin_deg", "speed_deg_s", "acceleration_deg_s2", "home_deg", "link_radius_mm"
@@ -148,23 +142,6 @@ class RobotConfig(Section):
                 )
         if outside:
             raise ValueError("; ".join(outside))
-        return value
-
-    @field_validator("target_mount")
-    @classmethod
-    def _passive_arm_has_mount(cls, value: TransformConfig | None, info: ValidationInfo) -> Any:
-        role = info.data.get("role")
-        if role == "passive" and value is None:
-            raise ValueError("missing key: the passive arm carries the target")
-        if role == "active" and value is not None:
-            raise ValueError("must be left out: the active arm carries the camera")
-        return value
-
-    @field_validator("target_mount_sigma")
-    @classmethod
-    def _of_a_mount(cls, value: TransformSigma | None, info: ValidationInfo) -> Any:
-        if value is not None and info.data.get("role") == "active":
-            raise ValueError("must be left out: the active arm carries the camera")
         return value
 
     @property
@@ -221,6 +198,34 @@ class RobotConfig(Section):
         """(n,) m."""
         joints = len(self.kinematics.dh)
         return np.array(self.link_radius_mm or [55.0 if i < 3 else 45.0 for i in range(joints)]) / 1000
+
+
+class RobotConfig(ArmConfig):
+    """One arm. Lists have one entry a joint."""
+
+    role: Literal["active", "passive"]
+    """The active arm carries the camera, the passive arm the target."""
+    target_mount: TransformConfig | None = Field(default=None, validate_default=True)
+    """Target in the passive flange; the passive arm's alone."""
+    target_mount_sigma: TransformSigma | None = None
+    """How exact target_mount is; exact where left out."""
+
+    @field_validator("target_mount")
+    @classmethod
+    def _passive_arm_has_mount(cls, value: TransformConfig | None, info: ValidationInfo) -> Any:
+        role = info.data.get("role")
+        if role == "passive" and value is None:
+            raise ValueError("missing key: the passive arm carries the target")
+        if role == "active" and value is not None:
+            raise ValueError("must be left out: the active arm carries the camera")
+        return value
+
+    @field_validator("target_mount_sigma")
+    @classmethod
+    def _of_a_mount(cls, value: TransformSigma | None, info: ValidationInfo) -> Any:
+        if value is not None and info.data.get("role") == "active":
+            raise ValueError("must be left out: the active arm carries the camera")
+        return value
 
     @property
     def target_mount_transform(self) -> Array:

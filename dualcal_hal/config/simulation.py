@@ -11,6 +11,7 @@ from dualcal_hal.config.nominal import TransformsConfig
 from dualcal_hal.config.robots import KinematicsConfig
 from dualcal_hal.config.values import Natural, NotNegative, Section
 from dualcal_hal.kinematics import Chain
+from dualcal_hal.transforms import Array
 
 if TYPE_CHECKING:
     from dualcal_hal.config.cell import CellConfig
@@ -25,6 +26,10 @@ class TruthConfig(TransformsConfig):
     def chains(self, cell: CellConfig) -> dict[str, Chain]:
         """The true chain of each arm of the cell."""
         return {name: self.kinematics.get(name, arm.kinematics).chain for name, arm in cell.robots.items()}
+
+    def target_mount(self, cell: CellConfig) -> Array:
+        """T_F_T (4, 4) as it is without the error ``target_mount``: what is known of it."""
+        return cell.passive.target_mount_transform
 
 
 class NoiseConfig(Section):
@@ -50,16 +55,21 @@ class NoiseConfig(Section):
         return self.encoder_mrad / 1000
 
 
-class SimulationConfig(Section):
-    """The simulated world; neither plan nor estimate may see it."""
+class SimulatedConfig(Section):
+    """What a simulated world has besides the truth."""
 
     seed: Natural
     """Of the noise and of the errors that are drawn."""
     stepper: Literal["kinematic", "bullet"]
     """What moves the simulated arms: kinematic moves them exactly, bullet by motors, with weight and contact."""
-    truth: TruthConfig
-    """The cell as it is."""
     noise: NoiseConfig = NoiseConfig()
     """What disturbs it anew each time."""
     errors: ErrorsConfig = ErrorsConfig()
     """What is wrong with it for good."""
+
+
+class SimulationConfig(SimulatedConfig):
+    """The simulated world; neither plan nor estimate may see it."""
+
+    truth: TruthConfig
+    """The cell as it is."""

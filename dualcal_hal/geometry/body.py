@@ -87,7 +87,7 @@ class ArmBody:
             clearances[0] = (self._own_distances(segments, self.pairs) + self.relief).min(axis=1)
         if self.floor is not None:
             heights = segments[..., 2][:, self.above_floor].min(axis=2) - radius[self.above_floor]
-            clearances[1] = heights.min(axis=1) - self.floor
+            clearances[1] = heights.min(axis=1, initial=np.inf) - self.floor
         for number, fixture in enumerate(self.fixtures, start=2):
             distance = fixture.separation(segments[:, self.moving], enough + radius[self.moving])
             clearances[number] = (distance - radius[self.moving]).min(axis=1)

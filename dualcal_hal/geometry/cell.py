@@ -71,7 +71,7 @@ class CellGeometry:
             (self.active, np.eye(4), self.passive, passive),
         ):
             near, radius = body.above_floor, body.capsules.radius[body.above_floor]
-            for fixture in standing.fixtures:
+            for fixture in standing.fixtures if len(near) else ():  # of a stand nothing is
                 distance = fixture.separation_from_afar(
                     T_A_base, segments[:, near], placement.translation, placement.rotation, enough + radius
                 )

@@ -177,7 +177,7 @@ def read_captures(
 _Finite = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST)]
 _Whole = Annotated[int, Field(strict=True)]
 _Size = Annotated[int, Field(strict=True, gt=0)]
-_Joints = Annotated[tuple[_Finite, ...], Field(min_length=1)]
+_Joints = tuple[_Finite, ...]  # none of a stand
 
 
 def _number_as_name(value: Any) -> Any:

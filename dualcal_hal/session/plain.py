@@ -128,6 +128,10 @@ class Fields:
         """A list of such numbers, as many as ``count``, else at least one."""
         return finites(self.any(name), name, count)
 
+    def joints(self, name: str) -> tuple[float, ...]:
+        """A list of such numbers, none of a stand."""
+        return tuple(finite(each, name) for each in self.items(name))
+
     def items(self, name: str) -> list[Any]:
         return list(expect(self.any(name), list, name))
 

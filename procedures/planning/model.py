@@ -86,7 +86,8 @@ class ArmModel:
         The joints move in proportion: the slowest sets the pace.
         """
         way = np.abs(np.asarray(goal, dtype=float) - np.asarray(start, dtype=float))
-        slowest, least_gain = np.max(way / self.speed, axis=-1), np.max(way / self.acceleration, axis=-1)
+        slowest = np.max(way / self.speed, axis=-1, initial=0.0)  # of a stand there is no joint
+        least_gain = np.max(way / self.acceleration, axis=-1, initial=0.0)
         ramp = least_gain / np.maximum(slowest, 1e-12)
         reaches_speed = ramp <= slowest
         return np.asarray(np.where(reaches_speed, slowest + ramp, 2 * np.sqrt(least_gain)))
@@ -119,7 +120,7 @@ class Posture:
     def from_record(cls, record: dict[str, Any]) -> Self:
         """And back, to the last bit; ValueError."""
         fields = Fields(record, "the posture")
-        return cls(fields.finites("active_rad"), fields.finites("passive_rad"))
+        return cls(fields.joints("active_rad"), fields.joints("passive_rad"))
 
 
 class CellModel:

@@ -40,7 +40,7 @@ class PlannedPosition:
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Self:
         fields = Fields(record, "the position")
-        passive = fields.finites("passive_joints_rad")
+        passive = fields.joints("passive_joints_rad")
         return cls(passive, fields.finite("distance_m"), fields.finite("tilt_rad"), fields.finite("clearance_m"))
 
 
@@ -89,7 +89,7 @@ class PlannedConstraint:
         return cls(
             name,
             cast(Use, use),
-            fields.finites("active_joints_rad"),
+            fields.joints("active_joints_rad"),
             positions,
             fields.finite("manipulability"),
             fields.finite("joint_margin_rad"),

@@ -68,8 +68,8 @@ def diagnose(options: DoctorOptions) -> int:
     """Look, or do the check that is asked for; the exit code."""
     _require_sense(options)
     file = load_cell(options.cell, options.overrides)
-    if options.arm is not None and options.arm not in file.cell.robots:
-        raise UsageError(f"there is no arm '{options.arm}'; there are: {', '.join(file.cell.robots)}")
+    if options.arm is not None and options.arm not in file.cell.arms:
+        raise UsageError(f"there is no arm '{options.arm}'; there are: {', '.join(file.cell.arms)}")
     # With --json standard output is for the document alone.
     console = Screen(stderr=options.json)
     commissioning = None if is_simulated(file.cell) else Commissioning.of(options.cell, file)
@@ -123,7 +123,7 @@ def _examine(
 def _examined(file: CellFile) -> Iterator[Examined]:
     """One device after the other, each opened alone, so that a failure is its own."""
     cell = file.cell
-    for device in (*cell.robots, CAMERA_NAME):
+    for device in (*cell.arms, CAMERA_NAME):
         name = backend_of(cell, device)
         yield Examined(device, f"{cell.backends[name].type} '{name}'", _findings(file, device))
 

@@ -53,7 +53,7 @@ def check_flanges(
 ) -> tuple[bool, dict[str, Any]]:
     """Whether all arms that are asked for were found good, and the document; what was found is recorded."""
     given: list[Posed] | None = None
-    arms = [options.arm] if options.arm is not None else list(file.cell.robots)
+    arms = [options.arm] if options.arm is not None else list(file.cell.arms)
     if options.poses is not None:
         arm, given = _of_file(options.poses, options.arm, file)
         arms = [arm]
@@ -83,8 +83,8 @@ def _of_file(path: Path, arm: str | None, file: CellFile) -> tuple[str, list[Pos
     if named is not None and arm not in (None, named):
         raise UsageError(f"{path}: has poses of '{named}', not of '{arm}'")
     arm = arm or named
-    if arm is None or arm not in file.cell.robots:
-        raise UsageError(f"{path}: say with --arm whose poses these are: {', '.join(file.cell.robots)}")
+    if arm is None or arm not in file.cell.arms:
+        raise UsageError(f"{path}: say with --arm whose poses these are: {', '.join(file.cell.arms)}")
     joints = file.cell.robots[arm].chain.joints
     for number, pose in enumerate(poses, start=1):
         if pose.joints is not None and len(pose.joints) != joints:

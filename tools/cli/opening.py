@@ -31,5 +31,5 @@ def backend_of(cell: CellConfig, device: str) -> str:
 
 def is_simulated(cell: CellConfig) -> bool:
     """Whether no real device stands behind any of them."""
-    names = {*(robot.backend for robot in cell.robots.values()), cell.camera.backend}
+    names = {*(robot.backend for robot in cell.arms.values()), cell.camera.backend}
     return all(backend_class(cell.backends[name].type).simulated for name in names)

@@ -43,8 +43,8 @@ def operate(options: OperateOptions) -> int:
     """Ask, do it, and say how the arm is afterwards; the exit code."""
     console = Screen()
     file = load_cell(options.cell, options.overrides)
-    if options.arm not in file.cell.robots:
-        raise UsageError(f"there is no arm '{options.arm}'; there are: {', '.join(file.cell.robots)}")
+    if options.arm not in file.cell.arms:
+        raise UsageError(f"there is no arm '{options.arm}'; there are: {', '.join(file.cell.arms)}")
     if not options.yes and not yes_or_no(console, _QUESTIONS[options.command].format(arm=options.arm)):
         raise UsageError("not confirmed; nothing was done")
     with opened_alone(file, options.arm) as backend:

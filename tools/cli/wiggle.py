@@ -62,7 +62,7 @@ def wiggle_arms(
     console: Console, file: CellFile, commissioning: Commissioning | None, options: WiggleOptions
 ) -> tuple[bool, dict[str, Any]]:
     """Whether every joint was seen to turn as it should, and the document; what was found is recorded."""
-    arms = [options.arm] if options.arm is not None else list(file.cell.robots)
+    arms = [options.arm] if options.arm is not None else list(file.cell.arms)
     cell, model = Cell(file), CellModel(file.cell)
     joints: dict[str, list[Joint]] = {}
     with cell:

@@ -49,7 +49,7 @@ class Emulator:
         self._path, self._overrides = path, tuple(overrides)
         self._file = load_cell(path, overrides)
         self._free_ports, self._say, self._failed = free_ports, say, failed
-        self._faults = [parse_fault(fault, self._file.cell.robots) for fault in faults]
+        self._faults = [parse_fault(fault, self._file.cell.arms) for fault in faults]
         self._controllers, self._cameras = _backends(self._file)
         _require_extras(self._controllers, self._cameras)
         self.endpoints: dict[str, Any] = {}
@@ -140,7 +140,7 @@ class Emulator:
 def _backends(file: CellFile) -> tuple[dict[str, ControllerOptions], list[str]]:
     """The controllers, with their options, and the cameras that the cell's devices are reached through."""
     cell = file.cell
-    used = {f"robots.{name}.backend": robot.backend for name, robot in cell.robots.items()}
+    used = {f"robots.{name}.backend": robot.backend for name, robot in cell.arms.items()}
     used["camera.backend"] = cell.camera.backend
     problems = []
     controllers: dict[str, ControllerOptions] = {}

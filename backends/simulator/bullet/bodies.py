@@ -147,6 +147,8 @@ class BulletBodies:
                 self._must_clear(arm, body, shape.moving if arm == owner else shape.above_floor)
         if cell.floor is not None:
             for arm, T_P_base in bases.items():
+                if arm not in cell.arms:
+                    continue  # under a stand there is none
                 level = T_P_base @ transform(np.eye(3), [0.0, 0.0, cell.floor])
                 floor = self._add_shape(HalfSpace(), level, "floor")
                 self.floors.append(floor)
@@ -181,7 +183,9 @@ class BulletBodies:
         self.drive(arm, q, np.zeros_like(q))
 
     def drive(self, arm: str, q: Array, velocity: Array) -> None:
-        """Set the motors' set points: (n,) in rad and rad/s."""
+        """Set the motors' set points: (n,) in rad and rad/s. A stand has no motors."""
+        if not len(q):
+            return
         pybullet.setJointMotorControlArray(
             targetPositions=q.tolist(), targetVelocities=velocity.tolist(), **self._motors[arm]
         )
@@ -189,6 +193,8 @@ class BulletBodies:
     def joints(self, arm: str) -> tuple[Array, Array]:
         """An arm's joint angles (n,) in rad and velocities (n,) in rad/s."""
         motors = self._motors[arm]
+        if not motors["jointIndices"]:
+            return np.zeros(0), np.zeros(0)
         states = pybullet.getJointStates(motors["bodyUniqueId"], motors["jointIndices"], physicsClientId=self.client)
         return np.array([state[0] for state in states]), np.array([state[1] for state in states])
 

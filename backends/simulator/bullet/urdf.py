@@ -15,6 +15,7 @@ from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import Array, apply, rotation_from_vector, transform
 
 _SECOND = ", second part"
+_STAND = 0.02  # m, the radius of what a stand weighs as
 _FREE = {"lower": "-100", "upper": "100", "effort": "1e4", "velocity": "100"}  # others mind the limits
 
 
@@ -49,7 +50,7 @@ def arm_urdf(chain: Chain, radii: Array, tool: Tool) -> str:
     robot = ElementTree.Element("robot", name="arm")
     for name, solids in zip(names, [*_links(chain, radii, after), [tool.solid]], strict=True):
         # A link without length is a joint's housing: it weighs something, and its neighbours' round ends cover it.
-        link = _add_link(robot, name, solids[0] if solids else ball(float(radii.min())))
+        link = _add_link(robot, name, solids[0] if solids else ball(float(radii.min()) if len(radii) else _STAND))
         if solids:
             _add_shape(link, solids[0])
         for second in solids[1:]:

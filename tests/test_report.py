@@ -14,16 +14,26 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.transforms import Bbox
+from scipy.stats import chi2
 
 from dualcal_hal.camera import Image
+from dualcal_hal.session.result import Result
 from procedures.analysis import analyse
+from procedures.estimation.refined.motion import moved
+from procedures.estimation.refined.uncertainty import spatial_error
 from procedures.report import draw_summary
+from procedures.report.accuracy_pictures import Slice
+from procedures.report.expected_mismatch import expected_mismatch
+from procedures.report.style import RED
 from procedures.report.summary import SIZE_PX, summary_figure
 from tests.reference_cell import ACTIVE, PASSIVE, T_F_T
 from tests.reference_run import captures, cell, plan, result
+from tests.refined_run import noisy_captures, refined_result, with_some_off
 
 PRINCIPAL_POINT = (511.5, 383.5)
 SHOWN = captures().captures[9]
@@ -47,6 +57,15 @@ def figure(**changed: Any) -> Figure:
 @pytest.fixture(scope="module")
 def drawn() -> Figure:
     return figure()
+
+
+def refined_figure(**changed: Any) -> Figure:
+    return figure(**{"captures": noisy_captures(), "result": refined_result(), **changed})
+
+
+@pytest.fixture(scope="module")
+def refined() -> Figure:
+    return refined_figure()
 
 
 def panel(figure: Figure, x_label: str) -> Axes:
@@ -182,6 +201,137 @@ def test_without_verification_captures_the_panel_says_so() -> None:
     assert not axes.lines
 
 
+def test_without_iterations_there_is_no_convergence(refined: Figure) -> None:
+    assert not [words for words in heads(refined) if "Convergence" in words]
+
+
+# -- what a refined result is worth ------------------------------------------------------------------------------------
+
+
+def accuracy_with(**fields: Any) -> Result:
+    accuracy = refined_result().accuracy
+    assert accuracy is not None
+    return replace(refined_result(), accuracy=accuracy.model_copy(update=fields))
+
+
+def requiring(millimetres: float) -> Result:
+    accuracy = refined_result().accuracy
+    assert accuracy is not None
+    return accuracy_with(error_3d=accuracy.error_3d.model_copy(update={"required_mm": millimetres}))
+
+
+def slices(figure: Figure) -> tuple[Axes, Axes]:
+    above, side = (axes for axes in figure.axes if axes.get_xlabel().startswith("x, mm   (at"))
+    return above, side
+
+
+def test_a_slice_goes_through_the_middle_of_the_region_and_shows_the_error_predicted_there() -> None:
+    accuracy = refined_result().accuracy
+    assert accuracy is not None
+    region = np.array([accuracy.error_3d.region.low_mm, accuracy.error_3d.region.high_mm])
+    cut = Slice.of(refined_result().T_P_A, accuracy, (0, 2))
+    assert cut.at == pytest.approx(region[:, 1].mean())
+    place = [cut.x[7] / 1e3, cut.at / 1e3, cut.y[30] / 1e3]
+    predicted = spatial_error(refined_result().T_P_A, np.array(accuracy.covariance), place).p95
+    assert cut.values[30, 7] == pytest.approx(1e3 * float(predicted))
+    corners = np.array(accuracy.error_3d.map.points_mm)[:, [0, 2]]
+    assert cut.x[0] < corners[:, 0].min() < corners[:, 0].max() < cut.x[-1]
+    assert cut.y[0] < corners[:, 1].min() < corners[:, 1].max() < cut.y[-1]
+
+
+def test_both_slices_outline_the_region_where_accuracy_is_required(refined: Figure) -> None:
+    accuracy = refined_result().accuracy
+    assert accuracy is not None
+    low, high = accuracy.error_3d.region.low_mm, accuracy.error_3d.region.high_mm
+    for axes, (across, up) in zip(slices(refined), ((0, 1), (0, 2)), strict=True):
+        (box,) = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
+        np.testing.assert_allclose(box.get_bbox().extents, [low[across], low[up], high[across], high[up]])
+        assert axes.get_ylabel() == f"{'xyz'[up]}, mm"
+
+
+@pytest.mark.parametrize(
+    ("required", "words", "red_lines"),
+    [(1.0, "kept all over", 0), (0.06, "the red line", 2), (0.01, "exceeded all over", 0)],
+)
+def test_the_map_says_where_the_required_accuracy_is_kept(required: float, words: str, red_lines: int) -> None:
+    drawn = refined_figure(result=requiring(required))
+    assert f"required: {required:g} mm, {words}" in legend(drawn, "Predicted 3D error")
+    reds = [
+        line
+        for axes in slices(drawn)
+        for line in axes.collections
+        if isinstance(line, ContourSet) and to_hex(line.get_edgecolor()[0]) == RED.lower()  # type: ignore[arg-type]
+    ]
+    assert len(reds) == red_lines
+
+
+FIT = "capture (a line between constraints)"
+
+
+def test_each_capture_stands_beside_the_band_of_what_is_expected(refined: Figure) -> None:
+    accuracy, verification = refined_result().accuracy, refined_result().verification
+    assert accuracy is not None
+    assert verification is not None
+    lines = {line.get_label(): line for line in panel(refined, FIT).lines}
+    for label, records in (("calibration", accuracy.captures), ("verification", verification.captures)):
+        expected = [np.sqrt(record.chi_square / record.degrees_of_freedom) for record in records]
+        np.testing.assert_allclose(lines[label].get_ydata(), expected)
+        ids = [noisy_captures().captures[int(number) - 1].id for number in lines[label].get_xdata()]
+        assert ids == [record.id for record in records]
+    band = panel(refined, FIT).collections[0].get_paths()[0].vertices
+    freedom = accuracy.captures[0].degrees_of_freedom
+    low, high = np.sqrt(chi2.ppf([0.025, 0.975], freedom) / freedom)
+    np.testing.assert_allclose([np.min(band[:, 1]), np.max(band[:, 1])], [low, high])  # type: ignore[index]
+
+
+def test_captures_that_were_left_out_are_marked_where_they_stand() -> None:
+    taken, found = with_some_off()
+    drawn = refined_figure(captures=taken, result=found)
+    assert "left out: 5" in legend(drawn, "How each capture fits")
+    (marked,) = [line for line in panel(drawn, FIT).lines if line.get_label() == "left out: 5"]
+    ids = {taken.captures[int(number) - 1].id for number in marked.get_xdata()}
+    assert ids == {rejected.id for rejected in found.captures_rejected}
+
+
+def test_the_mismatch_of_a_refined_result_has_no_limit_but_what_was_predicted(refined: Figure) -> None:
+    words = legend(refined, "Mismatch")
+    assert not [entry for entry in words if "limit" in entry]
+    assert "predicted (rms)" in words
+
+
+def test_the_mismatch_is_predicted_as_large_as_it_comes_out() -> None:
+    """Over errors drawn from the covariance and the noise of both arms, on the verification captures."""
+    accuracy, found, rng = refined_result().accuracy, refined_result(), np.random.default_rng(2)
+    assert accuracy is not None
+    verification = [capture for capture in noisy_captures().captures if capture.use == "verification"]
+    active = np.array([capture.active_joints for capture in verification])
+    passive = np.array([capture.passive_joints for capture in verification])
+    offset = (np.array([capture.feature for capture in verification]) - PRINCIPAL_POINT) / 812.0
+    squares = np.zeros(len(verification))
+    for error in rng.multivariate_normal(np.zeros(12), accuracy.covariance, 2000):
+        off_active = rng.normal(0, 1e-3 * accuracy.noise.active_joint_mrad, active.shape)
+        off_passive = rng.normal(0, 1e-3 * accuracy.noise.passive_joint_mrad, passive.shape)
+        T_P_E = moved(found.T_P_A, error[:6]) @ ACTIVE.forward(active + off_active) @ moved(found.T_H_E, error[6:])
+        p_P = (PASSIVE.forward(passive + off_passive) @ T_F_T)[:, :3, 3:]
+        p_E = (np.swapaxes(T_P_E[:, :3, :3], 1, 2) @ (p_P - T_P_E[:, :3, 3:]))[..., 0]
+        # The true axis passes the feature point where it was seen; the predicted one misses it by as much as this.
+        at_nominal = expected_point(found, active, passive)
+        squares += np.sum((p_E - at_nominal + offset_at(offset, at_nominal))[:, :2] ** 2, axis=1)
+    np.testing.assert_allclose(
+        expected_mismatch(cell(), verification, found, accuracy), np.sqrt(squares / 2000), rtol=0.08
+    )
+
+
+def expected_point(found: Result, active: np.ndarray[Any, Any], passive: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    T_P_E = found.T_P_A @ ACTIVE.forward(active) @ found.T_H_E
+    p_P = (PASSIVE.forward(passive) @ T_F_T)[:, :3, 3:]
+    return (np.swapaxes(T_P_E[:, :3, :3], 1, 2) @ (p_P - T_P_E[:, :3, 3:]))[..., 0]
+
+
+def offset_at(offset: np.ndarray[Any, Any], points: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    return np.column_stack([offset * points[:, 2:], np.zeros(len(points))])
+
+
 # -- the cell in 3D ----------------------------------------------------------------------------------------------------
 
 
@@ -197,13 +347,13 @@ def test_planned_positions_are_the_plans_and_the_head_says_how_far_they_were_mis
     np.testing.assert_allclose(points_3d(drawn, "planned: 42"), expected, atol=1e-9)
     missed = np.linalg.norm(points_3d(drawn, "reached: 42") - expected, axis=1).mean()
     assert missed > 1
-    assert heads(drawn)[-1] == f"Cell in the passive base P: reached {missed:.1f} mm from planned"
+    assert heads(drawn)[-1] == f"Cell in P: reached {missed:.1f} mm from planned"
 
 
 def test_without_a_plan_only_reached_positions_are_drawn() -> None:
     drawn = figure(plan=None)
     assert len(points_3d(drawn, "reached: 42")) == 42
-    assert heads(drawn)[-1] == "Cell in the passive base P"
+    assert heads(drawn)[-1] == "Cell in P"
 
 
 def test_each_optical_axis_starts_at_the_camera_and_passes_its_reached_positions(drawn: Figure) -> None:
@@ -232,6 +382,11 @@ def test_the_arms_stand_as_at_the_capture_that_is_shown(drawn: Figure) -> None:
     np.testing.assert_allclose(course[1], [0.0, 0.0, 136.5], atol=1e-9)  # along the first joint's axis by its d
     for frame in frames:
         assert np.linalg.norm(course - 1e3 * frame[:3, 3], axis=1).min() < 1e-9
+
+
+def test_what_the_papers_method_keeps_of_the_camera_is_called_nominal(drawn: Figure, refined: Figure) -> None:
+    assert "camera, its depth and roll nominal" in legend(drawn, "Cell in P")
+    assert not [words for words in legend(refined, "Cell in P") if "nominal" in words]
 
 
 def test_the_scene_has_the_same_scale_in_all_directions(drawn: Figure) -> None:
@@ -267,8 +422,29 @@ def _words(figure: Figure) -> list[tuple[str, Bbox]]:
         {"result": replace(result(), mismatch_before=None, mismatch_after=None, verdict="unverified")},
         {"cell": cell().model_copy(update={"name": "assembly cell 12, $left$ station"})},
         {"captures": replace(captures(), captures=tuple(replace(c, corners=None) for c in captures().captures))},
+        {"captures": noisy_captures(), "result": refined_result()},
+        {"captures": noisy_captures(0.003), "result": refined_result(0.003)},
+        {"captures": with_some_off()[0], "result": with_some_off()[1]},
+        {
+            "captures": noisy_captures(),
+            "result": replace(
+                refined_result(), mismatch_before=None, mismatch_after=None, verification=None, verdict="unverified"
+            ),
+        },
+        {"captures": noisy_captures(), "result": replace(requiring(0.06), verdict="coarse")},
     ],
-    ids=["as it is", "many reasons", "unverified", "long name", "no corners"],
+    ids=[
+        "as it is",
+        "many reasons",
+        "unverified",
+        "long name",
+        "no corners",
+        "refined",
+        "refined fails",
+        "refined, some left out",
+        "refined, unverified",
+        "refined, coarse",
+    ],
 )
 def test_no_words_are_cut_off_or_lie_on_others(changed: dict[str, Any]) -> None:
     words = _words(figure(**changed))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualcal_hal.config import CellConfig, NominalConfig
-from dualcal_hal.transforms import Array, rotation_from_vector
+from dualcal_hal.transforms import Array, smallest_rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +50,8 @@ def nominal_errors(T_P_A: Array, T_H_E: Array, nominal: NominalConfig) -> Nomina
 
 
 def _roll(R: Array, nominal: Array) -> float:
-    about = np.cross(nominal[:, 2], R[:, 2])
-    sine = float(np.linalg.norm(about))
-    angle = np.arctan2(sine, nominal[:, 2] @ R[:, 2])
-    least = rotation_from_vector(about * (angle / sine if sine > 0 else 1.0))
-    x, y = (least @ nominal)[:, :2].T @ R[:, 0]
+    tilted = smallest_rotation(nominal[:, 2], R[:, 2]) @ nominal
+    x, y = tilted[:, :2].T @ R[:, 0]
     return float(np.arctan2(y, x))
 
 

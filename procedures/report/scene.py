@@ -15,6 +15,7 @@ from dualcal_hal.session.captures import CaptureRecord
 from dualcal_hal.session.result import Result
 from dualcal_hal.transforms import Array, apply
 from procedures.planning.plan import Plan
+from procedures.report.kept import Kept
 from procedures.report.style import BLUE, DARK, GREEN, ORANGE, RED, TEXT, head, host
 
 if TYPE_CHECKING:
@@ -42,8 +43,9 @@ def draw_scene(
     panel = host(figure, place)
     # The projection leaves its corners empty, so it may be larger than its place.
     box = place.get_position(figure)
+    beside = 0.03 * box.width / 0.43
     axes = figure.add_axes(
-        (box.x0 - 0.05, box.y0 - 0.06, box.width + 0.08, box.height + 0.09), projection="3d", zorder=-1
+        (box.x0 - 0.05, box.y0 - 0.06, box.width + 0.05 + beside, box.height + 0.09), projection="3d", zorder=-1
     )
     axes.patch.set_visible(False)
 
@@ -73,7 +75,7 @@ def _planned(cell: CellConfig, plan: Plan) -> Positions:
 
 
 def _title(planned: Positions, reached: Positions) -> str:
-    title = "Cell in the passive base P"
+    title = "Cell in P"
     both = planned.keys() & reached.keys()
     if not both:
         return title
@@ -108,15 +110,17 @@ def _draw_arms(axes: Axes3D, cell: CellConfig, result: Result, shown: CaptureRec
     passive = arm_course(cell.passive.chain, shown.passive_joints)
     camera = np.vstack([active[-1], apply(T_P_E, field_of_view(cell))])
     target = apply(T_P_T, cell.target.board.outline[[0, 1, 2, 3, 0]])
-    for base, words, course, tool, colour in (
-        ("A", f"active arm ({cell.active_name})", active, camera, ORANGE),
-        ("P", f"passive arm ({cell.passive_name})", passive, target, DARK),
+    kept = Kept.of(result).words
+    nominal = f"camera, its {kept} nominal" if kept else None
+    for base, words, course, tool, beside, colour in (
+        ("A", f"active arm ({cell.active_name})", active, camera, nominal, ORANGE),
+        ("P", f"passive arm ({cell.passive_name})", passive, target, None, DARK),
     ):
         x, y, z = _mm(course).T
         axes.plot(x, y, z, color=colour, linewidth=4, marker="o", markersize=5, label=words)
         axes.text(x[0], y[0], z[0] - 90, base, fontsize=TEXT + 1, weight="bold", color=colour, ha="center")
         x, y, z = _mm(tool).T
-        axes.plot(x, y, z, color=colour, linewidth=2)
+        axes.plot(x, y, z, color=colour, linewidth=2, label=beside)
 
 
 def arm_course(chain: Chain, q: Joints) -> Array:

@@ -16,6 +16,8 @@ from dualcal_hal.session.captures import CaptureRecord, Captures
 from dualcal_hal.session.files import write_atomically
 from dualcal_hal.session.result import Mismatch, Result
 from procedures.planning.plan import Plan
+from procedures.report.accuracy_pictures import draw_error_map, draw_fit
+from procedures.report.expected_mismatch import expected_mismatch
 from procedures.report.frame import draw_frame
 from procedures.report.nominal_errors import PAPER_MISMATCH_MM, PAPER_UPDATE, is_papers_cell
 from procedures.report.scene import draw_scene
@@ -66,13 +68,21 @@ def summary_figure(
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(SIZE_PX[0] / _DPI, SIZE_PX[1] / _DPI), dpi=_DPI, facecolor="white")
-    grid = figure.add_gridspec(2, 2, left=0.055, right=0.985, bottom=0.055, top=0.825, wspace=0.15, hspace=0.40)
     shown = min(captures.captures, key=lambda capture: float(np.linalg.norm(np.subtract(feature_px, capture.feature))))
     _write_head(figure, cell, result)
-    draw_frame(figure, grid[0, 0], cell, captures.captures, image, shown)
-    _draw_convergence(figure.add_subplot(grid[0, 1]), result.iterations)
-    _draw_mismatch(figure.add_subplot(grid[1, 0]), cell, captures.captures, result)
-    draw_scene(figure, grid[1, 1], cell, plan, captures.captures, result, shown)
+    edges = {"left": 0.055, "right": 0.985, "bottom": 0.055, "top": 0.825, "hspace": 0.40}
+    above = figure.add_gridspec(2, 2, wspace=0.15, **edges)
+    draw_frame(figure, above[0, 0], cell, captures.captures, image, shown)
+    if result.accuracy is None:
+        _draw_convergence(figure.add_subplot(above[0, 1]), result.iterations)
+        below = [above[1, 0], above[1, 1]]
+    else:
+        draw_error_map(figure, above[0, 1], result, result.accuracy)
+        thirds = figure.add_gridspec(2, 3, wspace=0.2, width_ratios=(1, 1, 1.3), **edges)
+        draw_fit(figure.add_subplot(thirds[1, 0]), captures.captures, result, result.accuracy)
+        below = [thirds[1, 1], thirds[1, 2]]
+    _draw_mismatch(figure.add_subplot(below[0]), cell, captures.captures, result)
+    draw_scene(figure, below[1], cell, plan, captures.captures, result, shown)
     return figure
 
 
@@ -113,32 +123,41 @@ def _draw_mismatch(axes: Axes, cell: CellConfig, captures: Sequence[CaptureRecor
 
     if result.mismatch_before is None or result.mismatch_after is None:
         head(axes, "Mismatch: not verified")
-        note = "no verification captures:\nthe mismatch on other constraints is not known"
+        note = "no verification captures:\nthe mismatch on other constraints\nis not known"
         axes.text(0.5, 0.5, note, ha="center", va="center", fontsize=TEXT + 2, transform=axes.transAxes)
         axes.set_axis_off()
         return
+    narrow = result.accuracy is not None
     for words, mismatch, marker, colour in (
         ("before", result.mismatch_before, "s", ORANGE),
         ("after", result.mismatch_after, "o", BLUE),
     ):
-        _draw_values(axes, words, mismatch, marker, colour)
-    limit = cell.procedure.verification.limit_mm
-    axes.axhline(limit, color=RED, linewidth=2, label=f"limit on the mean: {limit:g} mm")
+        largest = "" if narrow else f", max {1e3 * mismatch.max:.3g} mm"
+        _draw_values(axes, f"{words}: mean {1e3 * mismatch.mean:.3g} mm{largest}", mismatch, marker, colour)
+    verified = _verified(captures, result)
+    if result.accuracy is None:
+        limit = cell.procedure.verification.limit_mm
+        axes.axhline(limit, color=RED, linewidth=2, label=f"limit on the mean: {limit:g} mm")
+    else:
+        expected = 1e3 * expected_mismatch(cell, verified, result, result.accuracy)
+        number = np.arange(1, len(expected) + 1)
+        axes.plot(number, expected, "_", color=DARK, markersize=12, markeredgewidth=2, label="predicted (rms)")
     if is_papers_cell(cell):
         before, after = PAPER_MISMATCH_MM["mean"]
-        axes.axhline(before, color=GREY, linestyle=":", label=f"paper's means: {before:g} and {after:g} mm")
+        words, joined = ("paper:", ", ") if narrow else ("paper's means:", " and ")
+        axes.axhline(before, color=GREY, linestyle=":", label=f"{words} {before:g}{joined}{after:g} mm")
         axes.axhline(after, color=GREY, linestyle=":")
-    _separate_constraints(axes, [capture.constraint for capture in _verified(captures, result)])
+    _separate_constraints(axes, [capture.constraint for capture in verified])
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.margins(y=0.1)
-    label(axes, "verification capture (a line between constraints)", "feature point to optical axis, mm")
+    across = "a line between constraints" if not narrow else "lines: constraints"
+    label(axes, f"verification capture ({across})", "feature point to optical axis, mm")
     _tidy(axes)
-    head(axes, "Mismatch on the verification captures")
+    head(axes, "Mismatch, verification" if narrow else "Mismatch on the verification captures")
 
 
 def _draw_values(axes: Axes, words: str, mismatch: Mismatch, marker: str, colour: str) -> None:
     number = np.arange(1, len(mismatch.values) + 1)
-    words = f"{words}: mean {1e3 * mismatch.mean:.3g} mm, max {1e3 * mismatch.max:.3g} mm"
     axes.semilogy(number, 1e3 * np.array(mismatch.values), marker, color=colour, markersize=8, label=words)
     axes.axhline(1e3 * mismatch.mean, color=colour, linestyle="--", linewidth=1.5)
 

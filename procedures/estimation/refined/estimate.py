@@ -17,6 +17,7 @@ from procedures.estimation.refined.geometry import refuse_few, refuse_one_axis
 from procedures.estimation.refined.inexact import Inexact, Known, WithInexact, fit_inexact
 from procedures.estimation.refined.model import CELL, Model
 from procedures.estimation.refined.motion import motion_between
+from procedures.estimation.refined.mount import counted_from, find_mount, is_free_mount
 from procedures.estimation.refined.noise import FoundNoise, find_noise
 from procedures.estimation.refined.outliers import (
     Distances,
@@ -134,9 +135,14 @@ def refined(
     keep_all: no capture is dropped however badly it fits. estimate_noise: the sigmas are found from the captures; of
     ``noise`` only the ratio of both arms counts then, and where to begin. Raises Degenerate for captures that do not
     determine both transforms. inexact: knowns with a sigma, estimated with it as their prior, or else only reckoned
-    with in the covariance; Degenerate too for one that is free and cannot be seen.
+    with in the covariance; Degenerate too for one that is free and cannot be seen. A target mount that is free is
+    sought without what is given of it.
     """
     fixed = (further_starts, keep_all, observable or Limits())
+    given = knowns
+    if estimate_inexact and any(is_free_mount(one) for one in inexact):
+        mount = find_mount(data, knowns, noise)
+        knowns = given if mount is None else replace(given, T_F_T=mount)
     there = knowns
     if inexact and estimate_inexact:
         # What does not belong is told only once the knowns are about right.
@@ -150,7 +156,7 @@ def refined(
     if not inexact:
         return result
     found_knowns = _with_inexact(data, knowns, result.noise, result, inexact, estimate_inexact)
-    return _combined(result, found_knowns, inexact, fixed[2])
+    return _combined(result, counted_from(given, found_knowns), inexact, fixed[2])
 
 
 def _kept(data: CaptureArrays, result: Refined) -> CaptureArrays:

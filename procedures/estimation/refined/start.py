@@ -92,7 +92,7 @@ def camera_candidates(
     do not fit together; else only for those with unknown order or a single capture.
     """
     T_P_T = model.T_P_F @ model.knowns.T_F_T
-    rays, seen = _rays(model)
+    rays, seen = seen_rays(model)
     seen &= np.isfinite(rays).all(axis=-1)
     arrival, T_P_E = _together(model, T_P_T, rays, seen)
     together = np.bincount(model.arrival[seen.sum(axis=1) >= 4], minlength=model.arrivals)
@@ -100,7 +100,7 @@ def camera_candidates(
     alone = np.flatnonzero((seen.sum(axis=1) >= 4) & (thorough | (together < 2) | unsure)[model.arrival])
     if len(alone):
         boards = plane_poses(model.knowns.corners, rays[alone], seen[alone])
-        for poses in (boards, boards[~order_known[alone]] @ _HALF_TURN):
+        for poses in (boards, boards[~order_known[alone]] @ HALF_TURN):
             of = alone if len(poses) == len(alone) else alone[~order_known[alone]]
             arrival = np.concatenate([arrival, np.repeat(model.arrival[of], 2)])
             T_P_E = np.concatenate([T_P_E, camera_poses(T_P_T[of][:, None], poses).reshape(-1, 4, 4)])
@@ -112,10 +112,10 @@ def camera_candidates(
     return _distinct(model, _agreed(model, T_P_T, order_known, arrival, T_P_E))
 
 
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
-def _rays(model: Model) -> tuple[Array, Mask]:
+def seen_rays(model: Model) -> tuple[Array, Mask]:
     """(k, n, 2) normalised undistorted, NaN where there is no such point, and which corners were seen."""
     seen = model.seen.copy()
     centre = model.knowns.matrix[:2, 2]
@@ -165,7 +165,7 @@ def _agreed(model: Model, T_P_T: Array, order_known: Mask, arrival: Indices, T_P
         np.add.at(towards, of, weights[:, None] * gradient)
         floor = (1e-9 * np.trace(summed, axis1=1, axis2=2) + 1e-9)[:, None, None] * np.eye(6)
         step = np.linalg.solve(summed + floor, -towards[..., None])[..., 0]
-        T_P_E = moved(T_P_E, _held(step))
+        T_P_E = moved(T_P_E, held(step))
         if off.max(initial=0.0) < _WELL and -np.sum(step * towards, axis=1).min(initial=0.0) < _WELL:
             break
     loss = np.zeros(len(T_P_E))
@@ -198,7 +198,7 @@ def _sights(model: Model, T_E_T: Array, which: Indices, flipped: Mask) -> tuple[
     return np.where(behind, np.inf, squares), W, gw
 
 
-def _held(motion: Array) -> Array:
+def held(motion: Array) -> Array:
     """Motions (..., 6) no longer than what keeps a far step from jumping: 0.3 m and 0.5 rad."""
     size = np.maximum(np.linalg.norm(motion[..., :3], axis=-1) / 0.3, np.linalg.norm(motion[..., 3:], axis=-1) / 0.5)
     return np.asarray(motion / np.maximum(size, 1.0)[..., None])
@@ -305,7 +305,7 @@ def _fitted(model: Model, poses: Poses, T_P_A: Array, T_H_E: Array) -> tuple[Arr
         gradient = np.sum((G_T @ towards[..., None])[..., 0], axis=1)
         damping = (1e-9 * np.trace(normal, axis1=1, axis2=2) + 1e-9)[:, None, None] * np.eye(12)
         step = np.linalg.solve(normal + damping, -gradient[..., None])[..., 0]
-        T_P_A, T_H_E = moved(T_P_A, _held(step[:, :6])), moved(T_H_E, _held(step[:, 6:]))
+        T_P_A, T_H_E = moved(T_P_A, held(step[:, :6])), moved(T_H_E, held(step[:, 6:]))
     raise AssertionError
 
 

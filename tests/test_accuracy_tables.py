@@ -104,8 +104,14 @@ def test_the_budget_has_each_input_the_largest_first() -> None:
 
 
 def test_captures_that_fit_and_that_do_not_are_told_in_words() -> None:
-    assert "The calibration captures fit the noise (chi-square" in tables(refined_result())
-    assert "The calibration captures do not fit the noise (chi-square" in tables(refined_result(FAILED))
+    assert "Calibration captures fit the noise (chi-square" in tables(refined_result())
+    assert "Calibration captures do not fit the noise (chi-square" in tables(refined_result(FAILED))
+
+
+def test_noise_that_is_stated_too_large_is_told() -> None:
+    fit = accuracy(refined_result()).fit.model_copy(update={"chi_square": 101.0})
+    text = tables(changed(fit=fit))
+    assert f"fit better than the noise allows (chi-square 101 of {fit.degrees_of_freedom})" in text
 
 
 def test_noise_that_was_found_stands_beside_the_stated() -> None:

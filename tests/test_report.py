@@ -273,7 +273,7 @@ def test_each_capture_stands_beside_the_band_of_what_is_expected(refined: Figure
     assert accuracy is not None
     assert verification is not None
     lines = {line.get_label(): line for line in panel(refined, FIT).lines}
-    for label, records in (("calibration", accuracy.captures), ("verification", verification.captures)):
+    for label, records in (("calibration: fit", accuracy.captures), ("verification: fit", verification.captures)):
         expected = [np.sqrt(record.chi_square / record.degrees_of_freedom) for record in records]
         np.testing.assert_allclose(lines[label].get_ydata(), expected)
         ids = [noisy_captures().captures[int(number) - 1].id for number in lines[label].get_xdata()]
@@ -282,6 +282,13 @@ def test_each_capture_stands_beside_the_band_of_what_is_expected(refined: Figure
     freedom = accuracy.captures[0].degrees_of_freedom
     low, high = np.sqrt(chi2.ppf([0.025, 0.975], freedom) / freedom)
     np.testing.assert_allclose([np.min(band[:, 1]), np.max(band[:, 1])], [low, high])  # type: ignore[index]
+
+
+def test_the_fit_of_all_captures_together_is_told_in_words() -> None:
+    words = legend(
+        refined_figure(captures=noisy_captures(0.003), result=refined_result(0.003)), "How each capture fits"
+    )
+    assert {"calibration: do not fit", "verification: do not fit"} <= set(words)
 
 
 def test_captures_that_were_left_out_are_marked_where_they_stand() -> None:

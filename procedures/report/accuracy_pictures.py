@@ -19,7 +19,6 @@ from procedures.report.style import BLUE, DARK, GREEN, GREY, RED, TEXT, head, ho
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
 
@@ -65,15 +64,16 @@ def draw_error_map(figure: Figure, place: SubplotSpec, result: Result, accuracy:
     from matplotlib.colors import ListedColormap, Normalize
 
     panel = host(figure, place)
-    parts = place.subgridspec(1, 4, width_ratios=(1, 1, 0.07, 0.08), wspace=0.6)
+    parts = place.subgridspec(1, 4, width_ratios=(1, 1, 0.08, 0.08), wspace=0.55)
     slices = [Slice.of(result.T_P_A, accuracy, axes) for axes in ((0, 1), (0, 2))]
     least, most = min(cut.values.min() for cut in slices), max(cut.values.max() for cut in slices)
-    light = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.6, 256)))
-    colours = ScalarMappable(Normalize(least, most), light)
+    scale, colours = Normalize(least, most), ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.6, 256)))
     for column, cut in enumerate(slices):
-        _draw_slice(figure.add_subplot(parts[column]), cut, accuracy.error_3d, colours)
+        axes = figure.add_subplot(parts[column])
+        axes.pcolormesh(cut.x, cut.y, cut.values, shading="gouraud", cmap=colours, norm=scale)
+        _draw_lines(axes, cut, accuracy.error_3d)
     beside = figure.add_subplot(parts[2])
-    figure.colorbar(colours, cax=beside)
+    figure.colorbar(ScalarMappable(scale, colours), cax=beside)
     label(beside, "mm", "")
     required = accuracy.error_3d.required_mm
     where = "kept all over" if required >= most else "exceeded all over"
@@ -87,11 +87,10 @@ def draw_error_map(figure: Figure, place: SubplotSpec, result: Result, accuracy:
     head(panel, "Predicted 3D error of a point (95 %)")
 
 
-def _draw_slice(axes: Axes, cut: Slice, space: Error3dRecord, colours: ScalarMappable) -> None:
+def _draw_lines(axes: Axes, cut: Slice, space: Error3dRecord) -> None:
     from matplotlib.patches import Rectangle
     from matplotlib.ticker import MaxNLocator
 
-    axes.pcolormesh(cut.x, cut.y, cut.values, shading="gouraud", cmap=colours.cmap, norm=colours.norm)
     least, most = float(cut.values.min()), float(cut.values.max())
     levels = [level for level in MaxNLocator(5).tick_values(least, most) if least < level < most]
     if levels:
@@ -105,7 +104,6 @@ def _draw_slice(axes: Axes, cut: Slice, space: Error3dRecord, colours: ScalarMap
     region = Rectangle((left, bottom), right - left, top - bottom, fill=False, edgecolor=DARK, linestyle="--")
     region.set_linewidth(2)
     axes.add_patch(region)
-    axes.set_aspect("equal")
     axes.locator_params(nbins=5)
     across, up = ("xyz"[axis] for axis in cut.axes)
     (hidden,) = {*"xyz"} - {across, up}
@@ -117,20 +115,23 @@ def draw_fit(axes: Axes, captures: Sequence[CaptureRecord], result: Result, accu
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
     number = {capture.id: index for index, capture in enumerate(captures, start=1)}
-    verified = () if result.verification is None else result.verification.captures
-    for words, records, colour, marker in (
-        ("calibration", accuracy.captures, BLUE, "o"),
-        ("verification", verified, GREEN, "s"),
+    seen = result.verification
+    verified, fits = ((), False) if seen is None else (seen.captures, seen.probability >= seen.least_probability)
+    for words, records, all_fit, colour, marker in (
+        ("calibration", accuracy.captures, accuracy.fit.scale == 1, BLUE, "o"),
+        ("verification", verified, fits, GREEN, "s"),
     ):
         if not records:
             continue
         x = np.array([number[record.id] for record in records])
         freedom = np.array([record.degrees_of_freedom for record in records])
         ratio = np.sqrt(np.array([record.chi_square for record in records]) / freedom)
-        axes.semilogy(x, ratio, marker, color=colour, markersize=6, label=words)
+        axes.semilogy(
+            x, ratio, marker, color=colour, markersize=6, label=f"{words}: {'fit' if all_fit else 'do not fit'}"
+        )
         low, high = (np.sqrt(2 * gammaincinv(freedom / 2, share) / freedom) for share in _BAND)
-        band = {"label": "95 % of captures"} if words == "calibration" else {}
-        axes.fill_between(x, low, high, color=GREY, alpha=0.3, linewidth=0, **band)
+        band = "95 % of captures" if words == "calibration" else None
+        axes.fill_between(x, low, high, color=GREY, alpha=0.3, linewidth=0, label=band)
     dropped = [number[rejected.id] for rejected in result.captures_rejected if rejected.id in number]
     if dropped:
         top = np.full(len(dropped), 0.97)

@@ -147,12 +147,15 @@ def _budget(accuracy: Accuracy) -> Table:
 def _fit_words(accuracy: Accuracy) -> Iterator[str]:
     fit = accuracy.fit
     p = float(chdtrc(fit.degrees_of_freedom, fit.chi_square)) if fit.degrees_of_freedom > 0 else 1.0
+    numbers = f"chi-square {fit.chi_square:.0f} of {fit.degrees_of_freedom}"
     chance = f"p {p:.2g}" if p >= _LEAST_TOLD else f"p < {_LEAST_TOLD:g}"
-    numbers = f"chi-square {fit.chi_square:.0f} of {fit.degrees_of_freedom}, {chance}"
     if fit.scale > 1:
-        yield f"The calibration captures do not fit the noise ({numbers})."
+        yield f"Calibration captures do not fit the noise ({numbers}, {chance})."
+    elif 1 - p < _LEAST_TOLD:
+        yield f"Calibration captures fit better than the noise allows ({numbers}):"
+        yield "the noise is less than stated, and so are the errors above."
     else:
-        yield f"The calibration captures fit the noise ({numbers})."
+        yield f"Calibration captures fit the noise ({numbers}, {chance})."
     turned = [capture.id for capture in accuracy.captures if capture.turned]
     if turned:
         more = f" and {len(turned) - MOST_TURNED} more" if len(turned) > MOST_TURNED else ""

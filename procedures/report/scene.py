@@ -27,6 +27,7 @@ Positions = Mapping[tuple[str, int], Array]
 """Feature points (3,) in P, m, by constraint and number of the position."""
 
 _BEYOND = 1.1  # how far an axis is drawn, of the distance to its farthest position
+_NARROW = 0.4  # of the picture's width: in such a place the labels need what the projection leaves empty
 _FRUSTUM = 0.07  # m, how far the camera's field of view is drawn
 
 
@@ -43,9 +44,10 @@ def draw_scene(
     panel = host(figure, place)
     # The projection leaves its corners empty, so it may be larger than its place.
     box = place.get_position(figure)
-    beside = 0.03 * box.width / 0.43
+    narrow = box.width < _NARROW
+    right = 0.0 if narrow else 0.03
     axes = figure.add_axes(
-        (box.x0 - 0.05, box.y0 - 0.06, box.width + 0.05 + beside, box.height + 0.09), projection="3d", zorder=-1
+        (box.x0 - 0.05, box.y0 - 0.06, box.width + 0.05 + right, box.height + 0.09), projection="3d", zorder=-1
     )
     axes.patch.set_visible(False)
 
@@ -56,7 +58,7 @@ def draw_scene(
     if planned:
         _draw_points(axes, planned, f"planned: {len(planned)}", "none", BLUE, 80)
     _draw_points(axes, reached, f"reached: {len(reached)}", RED, RED, 14)
-    _finish(axes)
+    _finish(axes, zoom=1.0 if narrow else 1.15)
     head(panel, _title(planned, reached), axes)
 
 
@@ -145,12 +147,12 @@ def _mm(points: ArrayLike) -> Array:
     return np.asarray(1e3 * np.asarray(points))
 
 
-def _finish(axes: Axes3D) -> None:
+def _finish(axes: Axes3D, zoom: float) -> None:
     from matplotlib.ticker import MaxNLocator
 
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.set_aspect("equal")
-    axes.set_box_aspect([np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())], zoom=1.15)
+    axes.set_box_aspect([np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())], zoom=zoom)
     axes.view_init(elev=22, azim=-72)
     axes.set_xlabel("x, mm", fontsize=TEXT, labelpad=10)
     axes.set_ylabel("y, mm", fontsize=TEXT, labelpad=6)

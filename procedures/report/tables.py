@@ -89,6 +89,7 @@ def mismatch_table(cell: CellConfig, before: Mismatch, after: Mismatch) -> Table
     if is_papers_cell(cell):
         headers += ["paper before", "paper after", "less by"]
     table = _table("Mismatch on the verification captures, mm (Fig. 8)", *headers)
+    table.min_width = len(str(table.title)) + 1
     for name in ("mean", "rms", "p95", "max"):
         old, new = 1e3 * getattr(before, name), 1e3 * getattr(after, name)
         row = [name, f"{old:.3f}", f"{new:.3f}", _reduction(old, new)]

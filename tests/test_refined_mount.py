@@ -92,7 +92,7 @@ def test_board_poses_serve_where_the_corners_alone_would_not() -> None:
     T_P_E = cell.T_P_A @ cell.knowns.active.forward(data.active) @ cell.T_H_E
     poses = inverse(T_P_E) @ cell.knowns.passive.forward(data.passive) @ cell.knowns.T_F_T
     hidden = data.pixels.copy()
-    hidden[:, 3:] = np.nan  # three corners are too few for a homography
+    hidden[:, [1, 3, 4, 5, 7, 8]] = np.nan  # three corners are too few for a homography
     assert find_mount(replace(data, pixels=hidden), given(), NOISE) is None
     assert normalised(found_from(replace(data, pixels=hidden, board_poses=list(poses)))) < 45
 

@@ -55,7 +55,7 @@ def next_suspects(result: Refined, captures: CaptureArrays, names: Sequence[str]
     """In the order in which to look at them: what explains the captures first, then what explains most of what is too
     much, then the rest; in each group what is most often wrong in real cells first: the target's mount, the zeros of
     the joints, the calibration of the arms, a capture or an arrival that alone is off, and what no calibration mends.
-    None of these where the corners alone are too far off, or where one cell fits all captures.
+    Before these corners that are off whatever board, and none of these where one cell fits all captures.
 
     captures: all of them, in any order; names: of each, by default its index.
     """
@@ -65,14 +65,15 @@ def next_suspects(result: Refined, captures: CaptureArrays, names: Sequence[str]
         as_given = _fitted(result, captures, result.inexact)
     except (Degenerate, np.linalg.LinAlgError):
         return (Suspect(_LOOSE, 0.0, False),)
-    if as_given.corners_off() or as_given.explains():
-        return (Suspect(_CORNERS if as_given.corners_off() else _TOGETHER, 1.0, True),)
+    corners = (Suspect(_CORNERS, 0.0, False),) if as_given.corners_off() else ()
+    if as_given.explains():
+        return corners or (Suspect(_TOGETHER, 1.0, True),)
     found = [*_knowns(result, captures, as_given), *_left_out(result, captures, as_given, called)]
     explaining = [one for one in found if one.explains]
     mostly = [one for one in found if not one.explains and one.share >= _MOST_OF_IT]
     hardly = [one for one in found if not one.explains and one.share < _MOST_OF_IT]
     told = _LOOSE if explaining else f"{_LOOSE}; nothing else alone explains the captures"
-    return (*explaining, *mostly, Suspect(told, 0.0, False), *hardly)
+    return (*corners, *explaining, *mostly, Suspect(told, 0.0, False), *hardly)
 
 
 @dataclass(frozen=True)

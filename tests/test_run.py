@@ -89,7 +89,7 @@ def failed(tmp_path_factory):
             folder,
             "--seed",
             4,
-            *sets(*SMALL, FOUND_STAND_OFF, "procedure.verification.limit_mm=0.0001"),
+            *sets(*SMALL, FOUND_STAND_OFF, "procedure.method=paper", "procedure.verification.limit_mm=0.0001"),
         )
     return folder, result.exit_code
 
@@ -382,6 +382,47 @@ def test_a_length_in_metres_where_millimetres_are_meant_is_asked_about(override,
     result = dualcal("run", PAPER, "--dry-run", "--set", override)
     assert result.exit_code == 2
     assert what in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict"),
+    [
+        ("procedure.verification.required_accuracy_mm=0.001", "coarse"),
+        ("robots.right.target_mount.translation_mm=[0.0, -1.5, 2.8]", "fail"),
+    ],
+)
+def test_the_verdict_follows_what_the_cell_file_asks_and_says(session, tmp_path, change, verdict):
+    """Of a run that was captured already."""
+    shutil.copytree(session, tmp_path / "s")
+    text = load_cell(tmp_path / "s" / "cell.yaml", [change]).text
+    result = dualcal("estimate", tmp_path / "s" / "captures.json", "--cell", _written(tmp_path, text), "--json")
+    assert json.loads(result.stdout)["verdict"] == verdict
+
+
+def _written(folder, text):
+    (folder / "changed.yaml").write_text(text)
+    return folder / "changed.yaml"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--free", "joint_zeros"], "only target_mount and intrinsics can be free"),
+        (["--method", "paper", "--keep-all"], "are for method refined"),
+        (["--noise", "guess"], "guess"),
+    ],
+)
+def test_choices_that_cannot_be_are_told(session, options, words):
+    result = dualcal("estimate", session, *options)
+    assert result.exit_code == 2
+    assert words in result.stderr
+
+
+def test_the_noise_is_found_and_knowns_are_left_to_the_captures_by_choice(session):
+    result = dualcal("estimate", session, "--noise", "estimate", "--free", "target_mount", "--keep-all", "--json")
+    accuracy = json.loads(result.stdout)["accuracy"]
+    assert accuracy["noise"]["pixel_px"] < accuracy["stated_noise"]["pixel_px"]
+    assert len(accuracy["knowns"]) == 6
 
 
 def test_a_mismatch_above_the_limit_fails(failed):
@@ -832,7 +873,9 @@ def test_a_capture_with_the_active_arm_elsewhere_is_left_out_with_the_reason(tmp
     document = json.loads(REFERENCE.read_text())
     document["captures"][5]["active_joints_rad"][0] += 0.2
     (tmp_path / "captures.json").write_text(json.dumps(document))
-    found = json.loads(dualcal("estimate", tmp_path / "captures.json", "--cell", PAPER, "--json").stdout)
+    found = json.loads(
+        dualcal("estimate", tmp_path / "captures.json", "--cell", PAPER, "--method", "paper", "--json").stdout
+    )
     (rejected,) = found["captures_rejected"]
     assert rejected["id"] == "calibration/01/1"
     assert "11.46 deg" in rejected["reason"]
@@ -844,7 +887,9 @@ def test_a_constraint_thinned_by_rejected_captures_is_left_out_as_a_whole(tmp_pa
     for index in (4, 5):
         document["captures"][index]["active_joints_rad"][0] += 0.05 * (index - 3)
     (tmp_path / "captures.json").write_text(json.dumps(document))
-    found = json.loads(dualcal("estimate", tmp_path / "captures.json", "--cell", PAPER, "--json").stdout)
+    found = json.loads(
+        dualcal("estimate", tmp_path / "captures.json", "--cell", PAPER, "--method", "paper", "--json").stdout
+    )
     assert {rejected["id"] for rejected in found["captures_rejected"]} == {f"calibration/01/{i}" for i in range(4)}
     assert len(found["captures_used"]) == 24
     assert found["mismatch_mm"]["after"]["max"] < 1e-6
@@ -854,7 +899,9 @@ def test_a_joint_read_a_whole_turn_off_stands_where_the_others_do(tmp_path):
     document = json.loads(REFERENCE.read_text())
     document["captures"][5]["active_joints_rad"][5] -= 2 * np.pi
     (tmp_path / "captures.json").write_text(json.dumps(document))
-    found = json.loads(dualcal("estimate", tmp_path / "captures.json", "--cell", PAPER, "--json").stdout)
+    found = json.loads(
+        dualcal("estimate", tmp_path / "captures.json", "--cell", PAPER, "--method", "paper", "--json").stdout
+    )
     assert found["captures_rejected"] == []
 
 
@@ -884,7 +931,7 @@ def test_a_result_replaces_no_device(session):
         (lambda d: d["captures"][5].update(passive_joints_rad=[float("nan")] * 6), ["calibration/01/1"]),
         (lambda d: d.update(captures=[]), ["captures: is empty"]),
         (lambda d: d.update(format="dualcal.captures/2"), ["dualcal.captures/2"]),
-        (lambda d: d.update(captures=d["captures"][:8]), ["2 constraints"]),
+        (lambda d: d.update(captures=d["captures"][:8]), ["2 arrivals of the active arm", "at least 3 are needed"]),
     ],
 )
 def test_malformed_or_degenerate_captures_are_refused_and_nothing_is_written(tmp_path, change, words):

@@ -112,6 +112,7 @@ def test_noise_that_is_stated_too_large_is_told() -> None:
     fit = accuracy(refined_result()).fit.model_copy(update={"chi_square": 101.0})
     text = tables(changed(fit=fit))
     assert f"fit better than the noise allows (chi-square 101 of {fit.degrees_of_freedom})" in text
+    assert "some of it is less than stated; --noise estimate says which." in text
 
 
 def test_noise_that_was_found_stands_beside_the_stated() -> None:

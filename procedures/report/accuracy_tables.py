@@ -153,7 +153,7 @@ def _fit_words(accuracy: Accuracy) -> Iterator[str]:
         yield f"Calibration captures do not fit the noise ({numbers}, {chance})."
     elif 1 - p < _LEAST_TOLD:
         yield f"Calibration captures fit better than the noise allows ({numbers}):"
-        yield "the noise is less than stated, and so are the errors above."
+        yield "some of it is less than stated; --noise estimate says which."
     else:
         yield f"Calibration captures fit the noise ({numbers}, {chance})."
     turned = [capture.id for capture in accuracy.captures if capture.turned]

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from dualcal_hal.transforms import Array
+from dualcal_hal.kinematics import Chain
+from dualcal_hal.transforms import Array, apply, inverse, transform
 from procedures.estimation import Degenerate
 from procedures.estimation.refined import (
     Inexact,
+    Knowns,
     Refined,
     intrinsics,
     joint_zeros,
@@ -20,12 +23,17 @@ from procedures.estimation.refined import (
     square_size,
     target_mount,
 )
+from procedures.estimation.refined.hidden import hidden
+from procedures.estimation.refined.inexact import common_scale
 from tools.benchmarks.refined import NOISES, Cell, reference
 
 NOISE = NOISES[0]
 MOUNT = target_mount(5e-4, float(np.radians(0.1)))
 ZEROS = [joint_zeros("active", [1e-3] * 6), joint_zeros("passive", [1e-3] * 6)]
-LINKS = [link_parameters("active", 6, 2e-4, 3e-4), link_parameters("passive", 6, 2e-4, 3e-4)]
+ACTIVE, PASSIVE = (
+    chain for chain in (reference().knowns.active, reference().knowns.passive) if isinstance(chain, Chain)
+)
+LINKS = [link_parameters("active", ACTIVE, 2e-4, 3e-4), link_parameters("passive", PASSIVE, 2e-4, 3e-4)]
 LENS = intrinsics(1.0, 2.0, [0.01, 0.01, 1e-3, 1e-3, 0])
 
 
@@ -129,3 +137,77 @@ def test_contributions_add_up_to_the_covariance() -> None:
     reckoned = refined(data, cell.knowns, NOISE, inexact=[MOUNT], estimate_inexact=False)
     np.testing.assert_allclose(sum(reckoned.contributions.values()), reckoned.covariance, rtol=1e-6, atol=1e-14)
     assert np.trace(reckoned.contributions["target mount"]) > 10 * np.trace(plain.covariance)
+
+
+def test_a_scale_common_to_both_arms_cannot_be_free() -> None:
+    with pytest.raises(Degenerate, match="common scale of both arms"):
+        common_scale(np.inf)
+
+
+def test_a_hayati_row_has_a_beta_and_no_d_of_its_own() -> None:
+    """The captures show a beta that is off, given the rest."""
+    one = link_parameters("passive", PASSIVE, 2e-4, 1e-3)
+    assert "beta of row 2 of the passive arm" in one.names
+    assert "d of row 2 of the passive arm" not in one.names
+    off_by = np.where(np.array(one.names) == "beta of row 2 of the passive arm", 2e-3, 0.0)
+    true = one.shifted(reference().knowns, off_by)
+    cell = replace(reference(), knowns=true)
+    cell = replace(cell, data=replace(cell.data, pixels=cell.seen()))
+    alone = replace(one, **_only(one, int(np.argmax(off_by))))
+    found = refined(cell.noisy(np.random.default_rng(0), NOISE), reference().knowns, NOISE, inexact=[alone])
+    (known,) = found.known
+    assert known.seen
+    assert known.value == pytest.approx(2e-3, abs=4 * known.sigma)
+    assert known.sigma < 3e-4
+
+
+def _only(one: Inexact, index: int) -> dict[str, Any]:
+    def shifted(knowns: Knowns, by: Array) -> Knowns:
+        every = np.zeros(len(one.names))
+        every[index] = by[0]
+        return one.shifted(knowns, every)
+
+    at = slice(index, index + 1)
+    return {
+        "names": one.names[at],
+        "units": one.units[at],
+        "sigmas": one.sigmas[at],
+        "scale": one.scale[at],
+        "shifted": shifted,
+    }
+
+
+HIDDEN = {
+    "the zero of joint 1 of the passive arm, against its base": joint_zeros("passive", [1.0] + [0.0] * 5),
+    "the zero of joint 1 of the active arm, against its base": joint_zeros("active", [1.0] + [0.0] * 5),
+    "the common scale of both arms": common_scale(1.0),
+}
+
+
+@pytest.mark.parametrize("what", HIDDEN)
+def test_the_effect_of_what_cannot_be_seen_is_the_error_it_makes(what: str) -> None:
+    """Where squares are no better known than the arms, a common scale is as little seen as the others."""
+    cell, point = reference(), np.array([[0.5, 0.2, 0.4]])
+    by = 1e-3 if "scale" in what else np.radians(0.1)
+    true = HIDDEN[what].shifted(cell.knowns, np.array([by]))
+    turned = replace(cell, knowns=true)
+    if "scale" in what:
+        stretched = [transform(T[:3, :3], (1 + by) * T[:3, 3]) for T in (cell.T_P_A, cell.T_H_E, true.T_F_T)]
+        larger = replace(true, corners=true.corners * (1 + by), T_F_T=stretched[2])
+        turned = replace(turned, knowns=larger, T_P_A=stretched[0], T_H_E=stretched[1])
+    taken = replace(turned.data, pixels=turned.seen())
+    found = refined(taken, cell.knowns, NOISE)
+    assert found.cost < 1e-6
+    told = next(one for one in hidden(found, point) if one.what == what)
+    held = point * (1 + by) if "scale" in what else point  # an arm that is larger is farther than it reads
+    there = apply(inverse(turned.T_P_A), held) - apply(inverse(found.T_P_A), point)
+    assert told.error == pytest.approx(np.linalg.norm(there), rel=0.01)
+
+
+def test_what_cannot_be_seen_is_told_with_its_stated_sigma() -> None:
+    cell = reference()
+    found = refined(cell.noisy(np.random.default_rng(0), NOISE), cell.knowns, NOISE, inexact=ZEROS)
+    told = {one.what: one for one in hidden(found, np.array([[0.5, 0.0, 0.4]]))}
+    passive = told["the zero of joint 1 of the passive arm, against its base"]
+    assert passive.by == "0.057 deg"
+    assert passive.error == pytest.approx(0.5e-3)

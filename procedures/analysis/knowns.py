@@ -79,8 +79,7 @@ def inexact_knowns(cell: CellConfig, free: Sequence[str]) -> list[Inexact]:
         if zeros is not None and any(zeros):
             found.append(joint_zeros(arm, np.radians(zeros).tolist()))
         if rows is not None and (rows.length_mm or rows.angle_deg):
-            joints_of = robot.chain.joints
-            found.append(link_parameters(arm, joints_of, rows.length_mm / 1000, float(np.radians(rows.angle_deg))))
+            found.append(link_parameters(arm, robot.chain, rows.length_mm / 1000, float(np.radians(rows.angle_deg))))
     return found
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from dualcal_hal.transforms import Array
 from procedures.estimation.refined.data import CaptureArrays, Knowns, Noise
 from procedures.estimation.refined.estimate import refined
-from procedures.estimation.refined.inexact import Inexact, joint_zeros, link_parameters, target_mount
+from procedures.estimation.refined.inexact import joint_zeros, link_parameters, target_mount
 from procedures.estimation.refined.model import Model
 from procedures.estimation.refined.suspects import next_suspects
 from procedures.estimation.refined.verification import Consistency, verify
@@ -109,7 +109,7 @@ def links_off(degrees: float, length: float) -> Wrong:
 
     def drawn(rng: np.random.Generator, knowns: Knowns) -> Knowns:
         for arm in ("active", "passive"):
-            links: Inexact = link_parameters(arm, 6, length, float(np.radians(degrees)))
+            links = link_parameters(arm, getattr(knowns, arm), length, float(np.radians(degrees)))
             knowns = links.shifted(knowns, rng.normal(0, links.sigmas))
         return knowns
 

@@ -92,20 +92,47 @@ def joint_zeros(arm: str, sigmas: Sequence[float]) -> Inexact:
     )
 
 
-def link_parameters(arm: str, joints: int, length: float, angle: float) -> Inexact:
-    """d, a and alpha of each row of the ``active`` or ``passive`` arm: sigmas in m and rad."""
+def link_parameters(arm: str, chain: Chain, length: float, angle: float) -> Inexact:
+    """Of each row of the ``active`` or ``passive`` arm with this chain: d, a and alpha, or a, alpha and beta of a
+    Hayati row, whose d is that of its neighbour; sigmas in m and rad.
+    """
+    kinds = [("d", "a", "alpha") if row.beta is None else ("a", "alpha", "beta") for row in chain.rows]
 
     def shifted(knowns: Knowns, by: Array) -> Knowns:
-        def moved_row(row: Row, d: float, a: float, alpha: float) -> Row:
-            return replace(row, d=row.d + d, a=row.a + a, alpha=row.alpha + alpha)
+        rows: tuple[Row, ...] = getattr(knowns, arm).rows
+        moved_rows = []
+        for row, kind, numbers in zip(rows, kinds, by.reshape(-1, 3), strict=True):
+            changed = {what: getattr(row, what) + float(number) for what, number in zip(kind, numbers, strict=True)}
+            moved_rows.append(replace(row, **changed))
+        return _with_arm(knowns, arm, tuple(moved_rows))
 
-        rows = getattr(knowns, arm).rows
-        return _with_arm(knowns, arm, tuple(moved_row(row, *b) for row, b in zip(rows, by.reshape(-1, 3), strict=True)))
+    every = [(what, i + 1) for i, kind in enumerate(kinds) for what in kind]
+    names = tuple(f"{what} of row {i} of the {arm} arm" for what, i in every)
+    units = tuple("m" if what in ("d", "a") else "rad" for what, _ in every)
+    sigmas = np.array([length if unit == "m" else angle for unit in units])
+    return _without_exact(f"links of the {arm} arm", names, units, sigmas, np.ones(len(sigmas)), shifted)
 
-    names = tuple(f"{what} of row {i + 1} of the {arm} arm" for i in range(joints) for what in ("d", "a", "alpha"))
-    sigmas = np.tile([length, length, angle], joints)
-    units = ("m", "m", "rad") * joints
-    return _without_exact(f"links of the {arm} arm", names, units, sigmas, np.ones(3 * joints), shifted)
+
+def common_scale(relative: float) -> Inexact:
+    """All lengths of both arms by one part. Raises Degenerate for an infinite sigma: only squares of exactly known size
+    show it, and hardly.
+    """
+    if not np.isfinite(relative):
+        raise Degenerate(f"cannot be seen in the captures, so cannot be free: {COMMON_SCALE}")
+
+    def shifted(knowns: Knowns, by: Array) -> Knowns:
+        factor = 1 + float(by[0])
+        return _scaled(_scaled(knowns, "active", factor), "passive", factor)
+
+    return Inexact(COMMON_SCALE, (COMMON_SCALE,), ("",), np.array([relative]), np.ones(1), shifted)
+
+
+COMMON_SCALE = "common scale of both arms"
+
+
+def _scaled(knowns: Knowns, arm: str, factor: float) -> Knowns:
+    rows: tuple[Row, ...] = getattr(knowns, arm).rows
+    return _with_arm(knowns, arm, tuple(replace(row, d=factor * row.d, a=factor * row.a) for row in rows))
 
 
 def _with_arm(knowns: Knowns, arm: str, rows: tuple[Row, ...]) -> Knowns:
@@ -128,9 +155,10 @@ def _without_exact(
         every[moving] = by
         return shifted(knowns, every)
 
-    kept = [both for both, moves in zip(zip(names, units, strict=True), moving, strict=True) if moves]
-    of_kept, unit_of_kept = zip(*kept, strict=True)
-    return Inexact(what, of_kept, unit_of_kept, sigmas[moving], scale[moving], of_all)
+    kept = np.flatnonzero(moving)
+    return Inexact(
+        what, tuple(names[i] for i in kept), tuple(units[i] for i in kept), sigmas[moving], scale[moving], of_all
+    )
 
 
 @dataclass(frozen=True)

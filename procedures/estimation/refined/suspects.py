@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import Mask
 from procedures.estimation.degenerate import Degenerate
 from procedures.estimation.refined.data import CaptureArrays
@@ -129,11 +130,14 @@ def _fitted(result: Refined, captures: CaptureArrays, inexact: Sequence[Inexact]
 
 
 def _knowns(result: Refined, captures: CaptureArrays, as_given: _Fitted) -> Iterator[Suspect]:
-    joints = {"active": result.knowns.active.joints, "passive": result.knowns.passive.joints}
+    arms = {"active": result.knowns.active, "passive": result.knowns.passive}
+    chains = {arm: chain for arm, chain in arms.items() if isinstance(chain, Chain)}
+    zeros = [joint_zeros(arm, [_ZERO] * chain.joints) for arm, chain in chains.items()]
+    links = [link_parameters(arm, chain, *_LINK) for arm, chain in chains.items()]
     tried: list[tuple[str, list[Inexact], Callable[[Sequence[Known]], str]]] = [
         ("the target's mount on its flange", [target_mount(*_MOUNT)], _together),
-        ("the zeros of the joints", [joint_zeros(arm, [_ZERO] * n) for arm, n in joints.items()], _largest),
-        ("the calibration of the arms", [link_parameters(arm, n, *_LINK) for arm, n in joints.items()], _largest),
+        ("the zeros of the joints", zeros, _largest),
+        ("the calibration of the arms", links, _largest),
     ]
     for what, inexact, words in tried:
         freed = {one.what for one in inexact}

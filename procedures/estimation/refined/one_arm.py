@@ -224,13 +224,40 @@ def one_arm(
     has is called ``active``, and the target's mount is sought anyway), estimated with it as their prior or only
     reckoned with. Raises Degenerate for views that do not determine both transforms.
     """
+    result = refined_views(
+        views,
+        placement,
+        pixel_sigma,
+        further_starts=further_starts,
+        keep_all=keep_all,
+        estimate_noise=estimate_noise,
+        inexact=inexact,
+        estimate_inexact=estimate_inexact,
+        observable=observable,
+    )
+    return described(views, placement, result, observable)
+
+
+def refined_views(
+    views: Views,
+    placement: Placement,
+    pixel_sigma: float,
+    *,
+    further_starts: Sequence[tuple[ArrayLike, ArrayLike]] = (),
+    keep_all: bool = False,
+    estimate_noise: bool = False,
+    inexact: Sequence[Inexact] = (),
+    estimate_inexact: bool = True,
+    observable: Limits | None = None,
+) -> Refined:
+    """As :func:`one_arm`, the result as that of two arms, of which one is none: what ``verify`` takes."""
     data, knowns = as_captures(views, placement)
     enough = views.seen.sum(axis=1) >= FEWEST_CORNERS
     if enough.sum() < FEWEST_VIEWS:
         count = f"{enough.sum()} view{'s' if enough.sum() != 1 else ''}"
         raise Degenerate(f"{count} with at least {FEWEST_CORNERS} corners seen, at least {FEWEST_VIEWS} are needed")
     sigma = views.arm.sigma
-    result = refined(
+    return refined(
         data,
         knowns,
         Noise(pixel_sigma, sigma, sigma),
@@ -241,6 +268,12 @@ def one_arm(
         estimate_inexact=estimate_inexact,
         observable=observable,
     )
+    agree, seen = int(result.used.sum()), int(np.any(views.seen, axis=1).sum())
+    if 2 * agree <= seen:
+        raise Degenerate(
+            f"only {agree} of {seen} views agree with each other: see that each image has its own pose, that the camera"
+            f" {'is on the arm' if placement is Placement.ON_ARM else 'stays'} and that the target is the right one"
+        )
     return _one_arm(data, placement, result, observable or Limits())
 
 
@@ -267,7 +300,9 @@ def as_captures(views: Views, placement: Placement) -> tuple[CaptureArrays, Know
     )
 
 
-def _one_arm(data: CaptureArrays, placement: Placement, result: Refined, observable: Limits) -> OneArm:
+def described(views: Views, placement: Placement, result: Refined, observable: Limits | None = None) -> OneArm:
+    """The result of ``refined_views`` as that of one arm."""
+    data, _ = as_captures(views, placement)
     turned = data.turned(result.flipped)
     model = Model(turned, result.knowns, result.noise)
     residuals = model.residuals(model.state(result.T_P_A, result.T_H_E)) * result.noise.pixel
@@ -277,7 +312,7 @@ def _one_arm(data: CaptureArrays, placement: Placement, result: Refined, observa
         return np.asarray(M @ covariance @ M.T)
 
     covariance = seen_so(result.covariance)
-    found = directions(covariance, observable, ("camera", "target"))
+    found = directions(covariance, observable or Limits(), ("camera", "target"))
     parts = {"arm" if what == "active joints" else what: seen_so(part) for what, part in result.contributions.items()}
     parts.pop("passive joints")
     return OneArm(

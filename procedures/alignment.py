@@ -56,6 +56,8 @@ _WORST_CONDITION = 5.0  # of the Jacobian, in units in which it is near a rotati
 
 class Outcome(StrEnum):
     ALIGNED = "aligned"
+    SEEN = "seen"
+    """And not to be aligned: a view of a cell with one arm."""
     NOT_CONVERGED = "not converged"
     LOST = "lost"
     OUT_OF_REACH = "out of reach"

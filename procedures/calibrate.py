@@ -404,9 +404,7 @@ class Calibration:
         return found
 
     def _look_from(self, record: dict[str, Any]) -> LookRecord:
-        found = LookRecord.from_record(record)
-        _require_view(found.view, self._shape)
-        return found
+        return look_of(record, self._shape)
 
     def _plan_from(self, record: dict[str, Any]) -> Plan:
         plan = Plan.from_record(record)
@@ -448,6 +446,13 @@ def requests_of(procedure: ProcedureConfig) -> list[Request]:
         Request("verification", verification.constraints, verification.positions),
     ]
     return [request for request in requests if request.constraints]
+
+
+def look_of(record: dict[str, Any], shape: CellShape) -> LookRecord:
+    """What came of a look of a cell, as it is recorded; ValueError for anything else."""
+    found = LookRecord.from_record(record)
+    _require_view(found.view, shape)
+    return found
 
 
 def point_of(record: dict[str, Any], shape: CellShape) -> PointRecord:

@@ -257,7 +257,7 @@ def refined_views(
         count = f"{enough.sum()} view{'s' if enough.sum() != 1 else ''}"
         raise Degenerate(f"{count} with at least {FEWEST_CORNERS} corners seen, at least {FEWEST_VIEWS} are needed")
     sigma = views.arm.sigma
-    return refined(
+    result = refined(
         data,
         knowns,
         Noise(pixel_sigma, sigma, sigma),
@@ -274,7 +274,7 @@ def refined_views(
             f"only {agree} of {seen} views agree with each other: see that each image has its own pose, that the camera"
             f" {'is on the arm' if placement is Placement.ON_ARM else 'stays'} and that the target is the right one"
         )
-    return _one_arm(data, placement, result, observable or Limits())
+    return result
 
 
 def as_captures(views: Views, placement: Placement) -> tuple[CaptureArrays, Knowns]:

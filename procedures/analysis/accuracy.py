@@ -25,7 +25,7 @@ from dualcal_hal.session.accuracy import (
 )
 from dualcal_hal.session.captures import CaptureRecord
 from dualcal_hal.transforms import Array
-from procedures.analysis.knowns import feature_points
+from procedures.analysis.knowns import arrays, feature_points
 from procedures.estimation.refined import Limits, Noise, Refined
 from procedures.estimation.refined.guidance import would_help
 from procedures.estimation.refined.hidden import hidden
@@ -60,7 +60,7 @@ def accuracy_record(
         covariance=tuple(map(tuple, found.covariance.tolist())),
         directions=tuple(_directions(found)),
         limits=LimitsRecord(translation_mm=1e3 * limits.translation, rotation_deg=float(np.degrees(limits.rotation))),
-        would_help=would_help(found, cell.active.chain.forward(calibration[0].active_joints)),
+        would_help=would_help(found, arrays(calibration, cell)),
         condition=found.condition if np.isfinite(found.condition) else None,
         budget=tuple(_budget(found, region.mean(axis=0))),
         noise=_noise(found.noise),

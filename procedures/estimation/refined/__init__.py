@@ -2,9 +2,12 @@
 
 from procedures.estimation.refined.data import CaptureArrays, Knowns, Noise
 from procedures.estimation.refined.estimate import Alternative, Dropped, Refined, refined
+from procedures.estimation.refined.guidance import would_help
+from procedures.estimation.refined.hidden import Hidden, hidden
 from procedures.estimation.refined.inexact import (
     Inexact,
     Known,
+    common_scale,
     intrinsics,
     joint_zeros,
     link_parameters,
@@ -12,14 +15,18 @@ from procedures.estimation.refined.inexact import (
     target_mount,
 )
 from procedures.estimation.refined.noise import FoundNoise, Sigma
+from procedures.estimation.refined.suspects import Suspect, next_suspects
 from procedures.estimation.refined.uncertainty import Direction, Limits, SpatialError
+from procedures.estimation.refined.verification import Consistency, verify
 
 __all__ = [
     "Alternative",
     "CaptureArrays",
+    "Consistency",
     "Direction",
     "Dropped",
     "FoundNoise",
+    "Hidden",
     "Inexact",
     "Known",
     "Knowns",
@@ -28,10 +35,16 @@ __all__ = [
     "Refined",
     "Sigma",
     "SpatialError",
+    "Suspect",
+    "common_scale",
+    "hidden",
     "intrinsics",
     "joint_zeros",
     "link_parameters",
+    "next_suspects",
     "refined",
     "square_size",
     "target_mount",
+    "verify",
+    "would_help",
 ]

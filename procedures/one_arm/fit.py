@@ -3,31 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from dualcal_hal.config import OneArmConfig
+from dualcal_hal.errors import UsageError
 from dualcal_hal.robot import Joints
 from dualcal_hal.transforms import Array
-from procedures.estimation.refined.inexact import Inexact
-from procedures.estimation.refined.one_arm import JointReadings, OneArm, Placement, Views, one_arm
+from procedures.analysis.knowns import inexact_knowns
+from procedures.estimation.refined import Inexact, Refined
+from procedures.estimation.refined.arms import Inverted
+from procedures.estimation.refined.data import Knowns
+from procedures.estimation.refined.one_arm import JointReadings, Placement, Views, refined_views
 
-LEAST_PIXEL, LEAST_JOINT = 1e-3, 1e-7
-"""px and rad: what corners and joints scatter by at least, where a cell file says that they do not."""
+
+def placement_of(config: OneArmConfig) -> Placement:
+    return Placement.ON_ARM if config.camera_on_arm else Placement.FIXED
 
 
-def views_of(
-    config: OneArmConfig, joints: Sequence[Joints], corners: Sequence[Array], order_known: Sequence[bool] | None = None
-) -> Views:
+def joint_sigma(config: OneArmConfig) -> float:
+    """rad: by which a reading misses where the arm stood: its arrival's error and that of the mean of two readings."""
+    return float(np.hypot(config.arm.joint_sigma, config.arm.encoder_sigma / np.sqrt(2)))
+
+
+def views_of(config: OneArmConfig, joints: Sequence[Joints], corners: Sequence[Array]) -> Views:
     """joints: of the arm at each view, rad; corners: (n, 2) px each, NaN for one not seen."""
-    arm, intrinsics = config.arm, config.camera.intrinsics
+    intrinsics = config.camera.intrinsics
     return Views(
-        arm=JointReadings(arm.chain, np.array(joints), max(_sigma(config), LEAST_JOINT)),
+        arm=JointReadings(config.arm.chain, np.array(joints), joint_sigma(config)),
         pixels=np.stack(corners),
         corners=config.target.board.corners,
         matrix=intrinsics.matrix,
         distortion=intrinsics.distortion,
-        order_known=None if order_known is None else np.array(order_known),
     )
 
 
@@ -38,27 +46,46 @@ def estimate(
     keep_all: bool = False,
     find_noise: bool = False,
     inexact: Sequence[Inexact] = (),
-) -> OneArm:
+) -> Refined:
     """By the noise that the cell file states, or that the views show; the nominal is one start of several.
 
-    Raises Degenerate for views that do not determine both transforms.
+    Raises Degenerate for views that do not determine both transforms, UsageError where corners are said to be exact.
     """
-    nominal = config.nominal
-    return one_arm(
+    if config.camera.sigma_px == 0:
+        raise UsageError("camera.sigma_px: the estimate needs to know how exact a corner is; 0 is not possible")
+    return refined_views(
         views,
         placement_of(config),
-        max(config.camera.sigma_px, LEAST_PIXEL),
-        further_starts=[(nominal.camera, nominal.target)],
+        config.camera.sigma_px,
+        further_starts=[(config.nominal.camera, config.nominal.target)],
         keep_all=keep_all,
         estimate_noise=find_noise,
         inexact=inexact,
     )
 
 
-def placement_of(config: OneArmConfig) -> Placement:
-    return Placement.ON_ARM if config.camera_on_arm else Placement.FIXED
+def inexact_of(config: OneArmConfig, free: Sequence[str]) -> list[Inexact]:
+    """Knowns that carry a sigma in the cell file, and those that are to be free."""
+    if refused := [name for name in free if name != "intrinsics"]:
+        raise UsageError(f"--free {refused[0]}: with one arm only intrinsics can be free; the target is sought anyway")
+    found = [_of_the_arm(one) for one in inexact_knowns(config.as_two_arms(), free)]
+    return found if config.camera_on_arm else [_of_inverted(one) for one in found]
 
 
-def _sigma(config: OneArmConfig) -> float:
-    """rad: by which a reading misses where the arm stood: what it repeats by, and what its encoders scatter by."""
-    return float(np.hypot(config.arm.joint_sigma, config.arm.encoder_sigma / np.sqrt(2)))
+def _of_the_arm(one: Inexact) -> Inexact:
+    def said(text: str) -> str:
+        return text.replace("the active arm", "the arm").replace("the passive arm", "the arm")
+
+    return replace(one, what=said(one.what), names=tuple(map(said, one.names)))
+
+
+def _of_inverted(one: Inexact) -> Inexact:
+    """The same of an arm that is looked at from its flange, and is the active one then."""
+
+    def shifted(knowns: Knowns, by: Array) -> Knowns:
+        if not isinstance(knowns.active, Inverted):
+            return one.shifted(knowns, by)
+        there = one.shifted(replace(knowns, passive=knowns.active.arm), by)
+        return replace(there, active=Inverted(there.passive), passive=knowns.passive)
+
+    return replace(one, shifted=shifted)

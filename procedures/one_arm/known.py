@@ -13,7 +13,7 @@ from dualcal_hal.config import OneArmConfig
 from dualcal_hal.geometry import ArmBody, CellGeometry
 from dualcal_hal.robot import Joints
 from dualcal_hal.transforms import Array, inverse, rotation_from_vector, transform
-from procedures.estimation.refined.one_arm import OneArm, Placement
+from procedures.estimation.refined.one_arm import OneArm
 from procedures.planning.belief import LEAST_ERROR, Belief
 from procedures.planning.model import ArmModel, CellModel, Posture
 
@@ -42,15 +42,11 @@ class Known:
         return Known(config, "the nominal transforms")
 
     def by_views(self, found: OneArm) -> Known:
-        """By an estimate from so many views: three sigma of it, and at least what a fit is never trusted further than."""
+        """By an estimate from so many views: to within three sigma of it, and what is always allowed for."""
         camera, target = (_largest(found.covariance_of(name)) for name in found.placement.names)
         stands, carried = (target, camera) if self.config.camera_on_arm else (camera, target)
         config = self.config.known_as(found.camera, found.target, stands, carried)
         return Known(config, f"{int(np.sum(found.used))} views", looked=True)
-
-    @property
-    def placement(self) -> Placement:
-        return Placement.ON_ARM if self.config.camera_on_arm else Placement.FIXED
 
     @cached_property
     def model(self) -> CellModel:

@@ -19,9 +19,10 @@ from procedures.calibrate import LookRecord, PointRecord, look_of, point_of, req
 from procedures.detection import Detector
 from procedures.detection.outcome import corners_to_record
 from procedures.estimation import Degenerate
+from procedures.estimation.refined.one_arm import described
 from procedures.events import BeliefRefined, ConstraintGivenUp, LookTaken, NotHome, PlanReady, PointDone
 from procedures.going import go, here
-from procedures.one_arm.fit import estimate, views_of
+from procedures.one_arm.fit import estimate, placement_of, views_of
 from procedures.one_arm.known import Known
 from procedures.one_arm.views import Request, ViewPlanner
 from procedures.planning.model import Posture
@@ -143,7 +144,8 @@ class OneArmCalibration:
         """Go on by what the looks have shown; whether they tell enough."""
         joints = [view.active or view.passive for view in seen]
         try:
-            found = estimate(self._config, views_of(self._config, joints, [view.corners for view in seen]))
+            views = views_of(self._config, joints, [view.corners for view in seen])
+            found = described(views, placement_of(self._config), estimate(self._config, views))
         except Degenerate:
             return False
         if found.rms > WORST_FIT:

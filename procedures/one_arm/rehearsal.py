@@ -28,7 +28,7 @@ class RehearsedViews:
 
 
 def rehearse_views(cell: OneArmCell) -> RehearsedViews:
-    """From ``home``, with the nominal transforms. Raises NoPlan where a run would end before it has captured anything."""
+    """From ``home``, with the nominal transforms. Raises NoPlan where a run would end before it has seen anything."""
     config, procedure = cell.one_arm, cell.procedure
     known = Known.nominal(config)
     home = known.model.home

@@ -204,12 +204,12 @@ class ViewPlanner:
             raise NoPlan(
                 f"no plan: the flange is turned by no more than {np.rad2deg(turn):.0f} deg about a second axis by any "
                 f"{request.views} of {len(pool)} postures, and {np.rad2deg(LEAST_TURN):.0f} deg are needed. "
-                f"{counted(self.refused)}. What may help: a larger procedure.tilt_max_deg or smaller nominal.uncertainty"
+                f"{counted(self.refused)}. A larger procedure.tilt_max_deg may help, or a smaller nominal.uncertainty"
             )
         return chosen
 
     def _in_order(self, chosen: _Candidates, start: Joints) -> _Candidates:
-        """By the seconds that straight moves from one to the next take; joints in the turn nearest to where they are."""
+        """By the seconds that straight moves from one to the next take; joints turned to where they are nearest."""
         arm, joints = self._known.arm, chosen.joints
         first = arm.move_time(np.array(start), arm.nearest_turn(joints, np.array(start)))
         between = arm.move_time(joints[:, None], arm.nearest_turn(joints[None], joints[:, None]))

@@ -11,7 +11,6 @@ from dualcal_hal.transforms import Array, apply, inverse
 from procedures.estimation.projection import project, undistort
 from procedures.estimation.refined.data import CaptureArrays, Knowns
 from procedures.estimation.refined.inexact import Inexact
-from procedures.estimation.refined.model import State
 from procedures.estimation.refined.one_arm import OneArm, Views, as_captures
 from procedures.estimation.refined.refit import both, corners_alone, refit
 
@@ -49,13 +48,21 @@ def leave_one_out(views: Views, result: OneArm, inexact: Sequence[Inexact] = ())
         left = number % MOST_FITS == fold
         fitted = refit(views, result, result.used & ~left, noise, inexact)
         for view in np.flatnonzero(left & np.any(views.seen, axis=1)):
-            pixels[view], at_target[view] = _predicted(data.only(number == view), fitted.knowns, fitted.state)
+            one = predicted(data.only(number == view), fitted.knowns, fitted.state.T_P_A, fitted.state.T_H_E)
+            pixels[view], at_target[view] = one.pixels[0], one.at_target[0]
     return LeftOut(pixels, at_target)
 
 
-def _predicted(view: CaptureArrays, knowns: Knowns, state: State) -> tuple[Array, Array]:
-    """Of one view (n, 2), px, and (n,), m, with the arm where it was read."""
-    T_E_T = inverse(state.T_P_A @ knowns.active.forward(view.active[0]) @ state.T_H_E)
+def predicted(views: CaptureArrays, knowns: Knowns, T_P_A: Array, T_H_E: Array) -> LeftOut:
+    """Views with the arm where it was read, by transforms (4, 4) that come from elsewhere."""
+    every = (_predicted(views.only(np.arange(len(views)) == k), knowns, T_P_A, T_H_E) for k in range(len(views)))
+    pixels, at_target = zip(*every, strict=True)
+    return LeftOut(np.stack(pixels), np.stack(at_target))
+
+
+def _predicted(view: CaptureArrays, knowns: Knowns, T_P_A: Array, T_H_E: Array) -> tuple[Array, Array]:
+    """Of one view (n, 2), px, and (n,), m."""
+    T_E_T = inverse(T_P_A @ knowns.active.forward(view.active[0]) @ T_H_E)
     points, seen = apply(T_E_T, knowns.corners), view.pixels[0]
     off = project(points, knowns.matrix, knowns.distortion) - seen
     there = np.isfinite(seen).all(axis=1)

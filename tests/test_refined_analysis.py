@@ -268,6 +268,11 @@ class TestKnowns:
         found = analyse(noisy(1), cell(f"{MOUNT}=[9.5, -6.5, 2.8]"), "refined", Choices(free=("target_mount",)))
         assert found.verdict == "ok"
         assert all(one.prior_sigma is None for one in accuracy(found).knowns)
+        assert found.mismatch_after is not None
+        assert 1e3 * found.mismatch_after.mean < 0.2  # the mount found, not the one that was given
+        total = np.diag(np.array(accuracy(found).covariance)).reshape(4, 3).sum(axis=1)
+        told = [one.base_translation_mm for one in accuracy(found).budget]
+        assert np.hypot.reduce(told) == pytest.approx(1e3 * np.sqrt(total[0]), rel=0.05)
 
     def test_zeros_links_squares_and_lens_carry_sigmas_too(self) -> None:
         found = analyse(

@@ -34,6 +34,9 @@ from procedures.estimation.refined.uncertainty import spatial_error
 _MAP = (7, 7, 5)
 """Points of the map along x, y and z."""
 
+_REST = 0.05
+"""Of the whole sigma, from which on what no input brings in is told."""
+
 _WITHIN = (3, 3, 3)
 """Points of the region that are looked at: the error is largest in a corner, as its square is convex."""
 
@@ -111,7 +114,12 @@ def _directions(found: Refined) -> Iterator[DirectionRecord]:
 
 
 def _budget(found: Refined, middle: Array) -> Iterator[SpreadRecord]:
-    for name, covariance in found.contributions.items():
+    """The rest is what the captures lose by showing knowns besides the transforms."""
+    rest = found.covariance - np.sum(list(found.contributions.values()), axis=0)
+    parts_of = dict(found.contributions)
+    if found.known and np.trace(rest[:3, :3]) > _REST**2 * np.trace(found.covariance[:3, :3]):
+        parts_of["knowns found as well"] = rest
+    for name, covariance in parts_of.items():
         parts = np.sqrt(np.maximum(np.diag(covariance).reshape(4, 3).sum(axis=1), 0.0))
         yield SpreadRecord(
             input=name,

@@ -12,17 +12,21 @@ from dualcal_hal.errors import DegenerateCaptures, UsageError
 from dualcal_hal.session.accuracy import Accuracy, Verification, VerifiedCaptureRecord
 from dualcal_hal.session.captures import CaptureRecord, Captures
 from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Rejected, Result, Unobservable, Verdict
-from dualcal_hal.transforms import Array
+from dualcal_hal.transforms import Array, smallest_rotation, transform
 from procedures.analysis.accuracy import accuracy_record, region_of
 from procedures.analysis.knowns import arrays, given_knowns, inexact_knowns, stated_noise
-from procedures.analysis.verification import CalibratedPlaces, mismatch_of, mismatch_record, words_for
-from procedures.estimation import Degenerate
+from procedures.analysis.verification import CalibratedPlaces, joints, mismatch_of, mismatch_record, words_for
+from procedures.estimation import Degenerate, Statistics, mismatch, statistics
+from procedures.estimation.projection import undistort
 from procedures.estimation.refined import Inexact, Refined, refined
 from procedures.estimation.refined.suspects import Suspect, next_suspects
 from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, verify
 
 FREE = ("target_mount", "intrinsics")
 """Knowns that can be left to the captures altogether."""
+
+
+_TOLD = 1e-4  # a smaller probability is told as below it
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,7 @@ def analyse_refined(captures: Captures, cell: CellConfig, choices: Choices) -> R
     suspects = _suspects(looked_at, found, calibration, verification, cell)
     verdict, reasons = _judge(looked_at, suspects, accuracy)
     before = mismatch_of(verification, cell, cell.nominal.T_P_A, cell.nominal.T_H_E)
-    after = mismatch_of(verification, cell, found.T_P_A, found.T_H_E)
+    after = _mismatch_after(verification, cell, found)
     return Result(
         method="refined",
         T_P_A=found.T_P_A,
@@ -111,6 +115,21 @@ def _looked_at(verification: Sequence[CaptureRecord], cell: CellConfig, found: R
     return verify(found, arrays(verification, cell)) if verification else None
 
 
+def _mismatch_after(verification: Sequence[CaptureRecord], cell: CellConfig, found: Refined) -> Statistics | None:
+    """Of the feature point, where the knowns that were found have it, from the line that is seen in the principal point
+    which was aligned with: the optical axis, but where intrinsics were found.
+    """
+    if not verification:
+        return None
+    knowns = found.knowns
+    aligned = undistort(cell.camera.intrinsics.principal_point, knowns.matrix, knowns.distortion)
+    turned = smallest_rotation([0.0, 0.0, 1.0], [*aligned.ravel(), 1.0])
+    active, passive = joints(verification, cell)
+    T_P_T = knowns.passive.forward(passive) @ knowns.T_F_T
+    axis = found.T_H_E @ transform(turned, [0.0, 0.0, 0.0])
+    return statistics(mismatch(found.T_P_A, axis, knowns.active.forward(active), T_P_T[:, :3, 3]))
+
+
 def _suspects(
     looked_at: Consistency | None,
     found: Refined,
@@ -135,7 +154,7 @@ def _judge(
         return "unverified", ("no verification captures: nothing shows that the noise is as stated", predicted)
     said = (
         f"chi-square {looked_at.statistic:.0f} of {looked_at.freedom:.0f} on {len(looked_at.captures)} captures,"
-        f" probability {looked_at.probability:.2g}"
+        f" probability {_chance(looked_at.probability)}"
     )
     if not looked_at.fits:
         return "fail", (
@@ -146,6 +165,10 @@ def _judge(
     if space.p95_mm > space.required_mm:
         return "coarse", (f"{predicted}, above the {space.required_mm:g} mm required", *reasons)
     return "ok", (f"{predicted}, within the {space.required_mm:g} mm required", *reasons)
+
+
+def _chance(probability: float) -> str:
+    return f"{probability:.2g}" if probability >= _TOLD else f"below {_TOLD:g}"
 
 
 def _verification_record(

@@ -138,7 +138,7 @@ def _draw_mismatch(axes: Axes, cell: CellConfig, captures: Sequence[CaptureRecor
     if result.accuracy is None:
         limit = cell.procedure.verification.limit_mm
         axes.axhline(limit, color=RED, linewidth=2, label=f"limit on the mean: {limit:g} mm")
-    else:
+    elif not result.accuracy.knowns:
         expected = 1e3 * expected_mismatch(cell, verified, result, result.accuracy)
         number = np.arange(1, len(expected) + 1)
         axes.plot(number, expected, "_", color=DARK, markersize=12, markeredgewidth=2, label="predicted (rms)")

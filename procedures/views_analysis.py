@@ -22,14 +22,16 @@ from dualcal_hal.session.views_result import (
     ViewResult,
     ViewsResult,
 )
-from dualcal_hal.transforms import Array, inverse
+from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.detection import Detection, Detector, Missed
 from procedures.estimation import Degenerate
 from procedures.estimation.refined.as_read import fit_as_read
-from procedures.estimation.refined.breakdown import FREE_LENS, Breakdown, break_down
+from procedures.estimation.refined.breakdown import FREE_LENS, break_down
 from procedures.estimation.refined.inexact import Inexact
 from procedures.estimation.refined.left_out import LeftOut, leave_one_out
+from procedures.estimation.refined.motion import logarithm
 from procedures.estimation.refined.one_arm import FlangePoses, OneArm, Placement, Views, one_arm
+from procedures.estimation.refined.uncertainty import Limits, directions
 from procedures.views_verdict import verdict_of
 
 PIXEL = 0.1
@@ -37,6 +39,8 @@ PIXEL = 0.1
 TRANSLATION, ROTATION = 1e-3, 1e-3
 """m and rad: of a flange pose, as long as none is found; what is found keeps their ratio."""
 
+_ROUGH_PIXEL = 1.0  # px: of the first fit
+_LEAST_PIXEL, _LEAST_ROTATION = 0.01, 1e-5  # px and rad, from where noise is sought
 _TELLS = 3.0  # times that the corners must be farther off with the other placement
 _BETTER = 0.9  # of left-out errors: below, the arm is taken where it was read
 _MOST_BYTES = 200_000_000
@@ -127,33 +131,83 @@ def _read_image(view: View) -> Image:
 
 def analyse_views(file: ViewsFile, seen: Seen, choices: ViewsChoices) -> ViewsResult:
     """Estimate from what was found in the images; DegenerateCaptures for views that do not determine the transforms."""
-    noise = choices.noise
-    views = _views(file, seen, noise)
+    views = _views(file, seen, choices.noise)
     try:
-        placement = _placement(file, views, noise)
+        placement, rough = _placed(file, views)
+        if choices.keep_all:
+            rough = replace(rough, used=views.seen.any(axis=1), dropped=())
+        fits = dict(_fits(views, file.flanges, rough, choices))
+        left_out = {name: leave_one_out(views, fit, choices.inexact) for name, fit in fits.items()}
+    except Degenerate as error:
+        raise DegenerateCaptures(f"{file.path}: the views do not tell where camera and target are: {error}") from error
+    attempts = {name: _attempt(fit, left_out[name], rough.used) for name, fit in fits.items()}
+    best = min(fits, key=lambda name: attempts[name].left_out_px * (1.0 if name == WITH_ERRORS else 1 / _BETTER))
+    residue = Residue(**asdict(break_down(views, fits[best])))
+    fit, moved = fits[best], None
+    if not choices.free_intrinsics and _lens_is_off(residue):
+        fit, moved = _reckoned_with_lens(views, rough, fit)
+    scale = 1.0 if choices.estimate_noise else fit.scale
+    result = _result(file, seen, choices, placement, fit, left_out[best], residue)
+    result = replace(result, attempts=attempts, moved_by_lens=moved)
+    verdict, reasons = verdict_of(result, scale)
+    return replace(result, verdict=verdict, reasons=reasons)
+
+
+def _fits(views: Views, flanges: Array, rough: OneArm, choices: ViewsChoices) -> Iterator[tuple[str, OneArm]]:
+    """By what is supposed of the flange poses; the most likely fit begins with the lens and the noise of the other."""
+    read = fit_as_read(views, rough, choices.inexact)
+    noise = choices.noise
+    if choices.estimate_noise:
+        yield AS_READ, read
+        rotation = max(read.arm_sigma, _LEAST_ROTATION)
+        lever = noise.translation / noise.rotation
+        noise = StatedNoise(max(read.pixel_sigma, _LEAST_PIXEL), lever * rotation, rotation)
+    begun = replace(
+        views,
+        arm=FlangePoses(flanges, noise.translation, noise.rotation),
+        matrix=read.matrix,
+        distortion=read.distortion,
+    )
+    try:
         likely = one_arm(
-            views,
-            Placement(placement.name),
+            begun,
+            rough.placement,
             noise.pixel,
             keep_all=choices.keep_all,
             estimate_noise=choices.estimate_noise,
             inexact=choices.inexact,
         )
-        fits = {WITH_ERRORS: likely}
-        if choices.estimate_noise:
-            fits[AS_READ] = fit_as_read(views, likely, choices.inexact)
-        left_out = {name: leave_one_out(views, fit, choices.inexact) for name, fit in fits.items()}
-        broken_down = break_down(views, likely)
-    except Degenerate as error:
-        raise DegenerateCaptures(f"{file.path}: the views do not tell where camera and target are: {error}") from error
-    attempts = {name: _attempt(fit, left_out[name]) for name, fit in fits.items()}
-    best = WITH_ERRORS
-    if AS_READ in attempts and attempts[AS_READ].left_out_px < _BETTER * attempts[WITH_ERRORS].left_out_px:
-        best = AS_READ
-    result = _result(file, seen, choices, placement, fits[best], left_out[best], broken_down)
-    result = replace(result, attempts=attempts)
-    verdict, reasons = verdict_of(result, 1.0 if choices.estimate_noise else likely.scale)
-    return replace(result, verdict=verdict, reasons=reasons)
+    except Degenerate:
+        if not choices.estimate_noise:
+            raise
+        return  # errors as large as the views would need leave nothing that could be told
+    yield WITH_ERRORS, likely
+
+
+def _lens_is_off(residue: Residue) -> bool:
+    """Whether the lens explains more of the residuals than the arm, which a wrong lens hides behind."""
+    shares = residue.shares
+    return "arm" in shares and shares["lens"] > shares["arm"]
+
+
+def _reckoned_with_lens(views: Views, rough: OneArm, fit: OneArm) -> tuple[OneArm, float | None]:
+    """The fit with a covariance that has by how much it moves as the lens is left to the images, and by how much the
+    camera then moves, m; None where that cannot be told.
+    """
+    try:
+        freed = fit_as_read(views, rough, FREE_LENS)
+    except Degenerate:
+        return fit, None
+    off = np.concatenate([logarithm(fit.camera, freed.camera), logarithm(fit.target, freed.target)])
+    of_lens = np.outer(off, off)
+    covariance = fit.covariance + of_lens
+    fit = replace(
+        fit,
+        covariance=covariance,
+        directions=directions(covariance, Limits(), ("camera", "target")),
+        contributions={**fit.contributions, "lens": of_lens},
+    )
+    return fit, float(np.linalg.norm(freed.camera[:3, 3] - fit.camera[:3, 3]))
 
 
 def _views(file: ViewsFile, seen: Seen, noise: StatedNoise) -> Views:
@@ -174,28 +228,31 @@ def _views(file: ViewsFile, seen: Seen, noise: StatedNoise) -> Views:
     )
 
 
-def _placement(file: ViewsFile, views: Views, noise: StatedNoise) -> PlacementFound:
-    """As the file states it, else the one with which the corners are far less off."""
-    if file.placement is not None:
-        return PlacementFound(file.placement, True, None)
-    off, reasons = {}, {}
-    for placement in Placement:
+def _placed(file: ViewsFile, views: Views) -> tuple[PlacementFound, OneArm]:
+    """As the file states it, else the one with which the corners are far less off; with a first fit, whose noise is so
+    large that a wrong lens makes no view doubtful.
+    """
+    stated = () if file.placement is None else (Placement(file.placement),)
+    fits: dict[Placement, OneArm] = {}
+    reasons: dict[Placement, Degenerate] = {}
+    begun = replace(views, arm=FlangePoses(file.flanges, TRANSLATION, ROTATION))
+    for placement in stated or Placement:
         try:
-            off[placement] = _typically_off(one_arm(views, placement, noise.pixel))
+            fits[placement] = one_arm(begun, placement, _ROUGH_PIXEL)
         except Degenerate as error:
             reasons[placement] = error
-    if not off:
-        raise reasons[Placement.ON_ARM]
-    best, *others = sorted(off, key=lambda placement: off[placement])
+    if not fits:
+        raise next(iter(reasons.values()))
+    best, *others = sorted(fits, key=lambda placement: _typically_off(fits[placement]))
     if not others:
-        return PlacementFound(best.value, False, None)
-    ratio = off[others[0]] / off[best]
+        return PlacementFound(best.value, bool(stated), None), fits[best]
+    ratio = _typically_off(fits[others[0]]) / _typically_off(fits[best])
     if ratio < _TELLS:
         raise Degenerate(
             "whether the camera is on the arm or stays beside it does not show; write "
             f'"placement": "{Placement.ON_ARM}" or "{Placement.FIXED}" into the file'
         )
-    return PlacementFound(best.value, False, ratio)
+    return PlacementFound(best.value, False, ratio), fits[best]
 
 
 def _typically_off(fit: OneArm) -> float:
@@ -204,9 +261,11 @@ def _typically_off(fit: OneArm) -> float:
     return float(np.median(np.sqrt(np.nanmean(fit.residuals[seen] ** 2, axis=(1, 2))))) + 1e-3
 
 
-def _attempt(fit: OneArm, left_out: LeftOut) -> Attempt:
-    pixels, metres = (values[fit.used] for values in left_out.rms())
-    return Attempt(fit.rms, float(np.sqrt(np.mean(pixels**2))), float(np.sqrt(np.mean(metres**2))))
+def _attempt(fit: OneArm, left_out: LeftOut, used: Mask) -> Attempt:
+    """Over the same views (k,) for all."""
+    pixels, metres = (values[used] for values in left_out.rms())
+    rms = float(np.sqrt(np.nanmean(fit.residuals[used] ** 2)))
+    return Attempt(rms, float(np.sqrt(np.mean(pixels**2))), float(np.sqrt(np.mean(metres**2))))
 
 
 def _result(
@@ -216,7 +275,7 @@ def _result(
     placement: PlacementFound,
     fit: OneArm,
     left_out: LeftOut,
-    broken_down: Breakdown,
+    residue: Residue,
 ) -> ViewsResult:
     found = fit.found
     lever = choices.noise.translation / choices.noise.rotation
@@ -232,13 +291,16 @@ def _result(
             fit.pixel_sigma,
             lever * fit.arm_sigma,
             fit.arm_sigma,
-            found is not None,
-            {} if found is None else {"corners": found.pixel.identified, "flange": found.joint.identified},
+            choices.estimate_noise,
+            {}
+            if found is None or fit.as_read
+            else {"corners": found.pixel.identified, "flange": found.joint.identified},
         ),
         rms=fit.rms,
-        residue=Residue(**asdict(broken_down)),
+        residue=residue,
         camera_error=_predicted(fit, np.zeros(3)),
         point_error=_predicted(fit, _middle(file, fit)),
+        moved_by_lens=None,
         views=tuple(_view_results(file, seen, fit, left_out)),
         intrinsics_given=given,
         distortion_known=file.distortion_known,
@@ -291,5 +353,5 @@ def _warnings(file: ViewsFile, fit: OneArm) -> Iterator[str]:
     yield from fit.warnings
     if not file.distortion_known and not fit.known:
         yield "the lens's distortion is not known, by the file; none was reckoned with: --free intrinsics finds it"
-    if fit.found is not None and not fit.found.joint.identified:
+    if fit.found is not None and not fit.as_read and not fit.found.joint.identified:
         yield "an error of the flange poses cannot be told from none; its upper bound was reckoned with"

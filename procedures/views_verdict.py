@@ -47,6 +47,8 @@ def verdict_of(result: ViewsResult, scale: float) -> tuple[str, tuple[str, ...]]
             f" {corners:.2g} px that they themselves {source}: what is off is something else"
         )
         reasons.append(f"for {name} that means: the camera's position is uncertain by {position}")
+        if result.moved_by_lens is not None:
+            reasons.append(f"it moves by {1e3 * result.moved_by_lens:.2g} mm as the intrinsics are left to the images")
         reasons += _look_at(result.residue, corners, freed=bool(result.intrinsics_sigmas))
     else:
         reasons.append(f"corners are off by {result.rms:.2g} px rms per axis, hardly more than their own noise")

@@ -174,8 +174,8 @@ def _problem(path: Path, lines: Sequence[int], details: Any) -> Problem:
         return Problem(where, f"{name}: is missing")
     if details["type"] == "value_error":
         return Problem(where, f"{name}: {details['ctx']['error']}")
-    said = details["msg"].replace("Input should be", "must be").replace("valid tuple", "list").replace("tuple", "list")
-    return Problem(where, f"{name}: {said[0].lower()}{said[1:]}")
+    said = details["msg"].replace("Input should be", "must be").replace("valid tuple", "list")
+    return Problem(where, f"{name}: {said.replace('Tuple', 'list')}")
 
 
 def _board(path: Path, target: _Target) -> tuple[Checkerboard | Charuco | None, list[Problem]]:

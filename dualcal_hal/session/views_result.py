@@ -134,7 +134,9 @@ class ViewsResult:
     poses: ``as read``, the corners fit best with the arm where it was read, or ``with errors``, the most likely with
     the arm off by its noise; attempts: of both by these names, or of the one there was. rms: of corners of used views,
     px per axis, with the arm where it was read. camera_error: of where the camera is; point_error: of a point where the
-    targets were. sigmas: of freed intrinsics, by COEFFICIENTS. feature: row and column of the target's origin.
+    targets were. moved_by_lens, m: by how much the camera moves if the lens, which does not fit, is left to the images;
+    it is part of the covariance; None where the lens fits or was freed. intrinsics_sigmas: of freed ones, by
+    COEFFICIENTS. feature: row and column of the target's origin.
     """
 
     placement: PlacementFound
@@ -147,6 +149,7 @@ class ViewsResult:
     residue: Residue
     camera_error: Predicted
     point_error: Predicted
+    moved_by_lens: float | None
     views: tuple[ViewResult, ...]
     intrinsics_given: Intrinsics
     distortion_known: bool
@@ -180,6 +183,7 @@ class ViewsResult:
             "predicted_error": {
                 "camera_position_mm": _predicted(self.camera_error),
                 "point_at_target_mm": _predicted(self.point_error),
+                "camera_moves_with_lens_freed_mm": None if self.moved_by_lens is None else 1e3 * self.moved_by_lens,
             },
             "residuals": {
                 "what": "px per axis, rms over all corners of the used views, flange poses taken as they were read",

@@ -55,7 +55,7 @@ def _placement(result: ViewsResult) -> str:
     if placement.stated:
         return f"{said}, as the file states."
     if placement.ratio is None:
-        return f"{said}; the other way round nothing explains the views."
+        return f"{said}; found so, the other way round nothing explains the views."
     return f"{said}; found so, the other way round corners are {placement.ratio:.0f} times as far off."
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualcal_hal.transforms import Array, Mask
+from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.estimation.degenerate import Degenerate
 from procedures.estimation.refined.data import Knowns, Noise
 from procedures.estimation.refined.inexact import Inexact, intrinsics
@@ -63,12 +63,21 @@ def break_down(views: Views, result: OneArm) -> Breakdown:
                 break
             fitted = refit(views, result, used, noise, inexact)
             steps.append(_sigma(fitted, noise, unknowns))
+            # The next step begins where this one ended: far from a lens that bends no board.
+            views, result = _continued(views, result, fitted)
             if inexact is everything:
                 off_places = _off_places(fitted, views.corners, np.any(views.seen[used], axis=0))
     except Degenerate:
         pass  # what cannot be seen is not told
     every: list[float | None] = [*steps, None, None, None]
     return Breakdown(steps[0], every[1], every[2], every[3], off_places)
+
+
+def _continued(views: Views, result: OneArm, fitted: Refit) -> tuple[Views, OneArm]:
+    matrix, distortion = fitted.knowns.matrix, fitted.knowns.distortion
+    camera, target = fitted.state.T_H_E, inverse(fitted.state.T_P_A)
+    result = replace(result, camera=camera, target=target, matrix=matrix, distortion=distortion)
+    return replace(views, matrix=matrix, distortion=distortion), result
 
 
 def _sigma(fitted: Refit, noise: Noise, unknowns: int) -> float:

@@ -38,6 +38,10 @@ def refuse_one_axis(T_A_H: Array, optical_axes: Array, joint: float, words: Word
     wander = np.sqrt(np.maximum(values, 0.0))
     if wander[2] < limit:
         raise Degenerate(f"the {flange} always has the same orientation: it was only shifted")
+    if ONE_AXIS < wander[0] < limit:
+        raise Degenerate(
+            f"the {flange} is off by {1e3 * joint:.3g} mrad, hardly less than it turns about a second axis"
+        )
     if wander[0] < limit:
         if _orientations(T_A_H[:, :3, :3], limit) < 3:
             raise Degenerate(f"the {flange} has only two orientations, at least 3 are needed")

@@ -11,6 +11,7 @@ from dualcal_hal.config.one_arm import (
     OneArmCell,
     OneArmConfig,
     OneArmDocument,
+    StandTruthConfig,
     is_of_one_arm,
     one_arm_problems,
 )
@@ -34,6 +35,7 @@ __all__ = [
     "ProcedureConfig",
     "RobotConfig",
     "SimulationConfig",
+    "StandTruthConfig",
     "is_of_one_arm",
     "one_arm_problems",
     "reference_problems",

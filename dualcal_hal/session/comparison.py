@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dualcal_hal.session.captures import CaptureRecord
-from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Result
+from dualcal_hal.session.one_arm_result import OneArmResult
+from dualcal_hal.session.result import Result
 from dualcal_hal.transforms import rotation_angle
 
 TOLERANCE_MM, TOLERANCE_RAD = 1e-6, 1e-9
@@ -56,13 +57,13 @@ def compare_captures(recorded: Sequence[CaptureRecord], now: Sequence[CaptureRec
     return Comparison(_same(there, here), _told(lines))
 
 
-def compare_results(recorded: Result, now: Result) -> Comparison:
+def compare_results(recorded: Result | OneArmResult, now: Result | OneArmResult) -> Comparison:
     """All that their files say; the transforms as such, whatever form the file gives them in besides."""
     there, here = recorded.to_document(), now.to_document()
     identical = _same(there, here)
     transforms = there.pop("transforms"), here.pop("transforms")
     lines: list[str] = []
-    for name in (T_P_A_NAME, T_H_E_NAME):
+    for name in transforms[0]:
         lines += _transform_differences(name, transforms[0][name]["matrix"], transforms[1][name]["matrix"])
     return Comparison(identical, _told([*lines, *differences(there, here)]))
 

@@ -25,7 +25,7 @@ from dualcal_hal.session.files import read_document, write_document
 from dualcal_hal.session.result import Rejected, Verdict, transform_document
 from dualcal_hal.transforms import Array, rotation_angle
 
-FORMAT = "dualcal.one-arm-result/1"
+FORMAT: Literal["dualcal.one-arm-result/1"] = "dualcal.one-arm-result/1"
 
 ERROR = "log(estimate^-1 truth) of each transform, in its child frame; translation in m, rotation in rad"
 """What the covariance is of."""

@@ -132,12 +132,12 @@ def read_result(path: Path) -> Result:
         raise FormatError([Problem(str(path), f"is not a result: {error}")]) from error
 
 
-def read_truth(path: Path) -> dict[str, Array]:
+def read_truth(path: Path, names: tuple[str, str] = (T_P_A_NAME, T_H_E_NAME)) -> dict[str, Array]:
     """True transforms by name, (4, 4) in m, from a JSON object that has both; FormatError otherwise."""
     document, truth = read_object(path), {}
-    unknown = sorted(set(document) - {T_P_A_NAME, T_H_E_NAME})
+    unknown = sorted(set(document) - set(names))
     problems = [Problem(str(path), f"{name}: unknown transform") for name in unknown]
-    for name in (T_P_A_NAME, T_H_E_NAME):
+    for name in names:
         if name not in document:
             problems.append(Problem(str(path), f"{name}: missing"))
             continue

@@ -24,7 +24,7 @@ from dualcal_hal.session.one_arm_result import (
     VerifiedViewRecord,
 )
 from dualcal_hal.session.result import Rejected, Verdict
-from dualcal_hal.transforms import Array, inverse
+from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.analysis import Choices
 from procedures.detection.outcome import corners_from_record
 from procedures.estimation import Degenerate
@@ -116,7 +116,7 @@ def _verified(captures: Sequence[CaptureRecord], off: LeftOut, looked_at: Consis
         )
 
 
-def _off(left_out: LeftOut, chosen: Array) -> OffRecord:
+def _off(left_out: LeftOut, chosen: Mask) -> OffRecord:
     """Over all corners of the chosen (k,) views."""
     pixels, at_target = left_out.pixels[chosen], left_out.at_target[chosen]
     rms = float(np.sqrt(np.nanmean(pixels**2))), float(np.sqrt(np.nanmean(at_target**2)))

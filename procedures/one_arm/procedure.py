@@ -61,6 +61,14 @@ class ViewsReady(PlanReady):
 
 
 @dataclass(frozen=True)
+class ViewDone(PointDone):
+    """A view was captured, or given up."""
+
+    def __str__(self) -> str:
+        return f"{self.constraint}: {self.outcome}{f' ({self.reason})' if self.reason else ''}"
+
+
+@dataclass(frozen=True)
 class PlaceContradicted:
     """The looks found what stands farther from its nominal place than ``nominal.uncertainty`` allows; m and rad."""
 
@@ -305,6 +313,6 @@ def _missed(outcome: Outcome, reason: str) -> PointRecord:
     return PointRecord(str(outcome), int(outcome is not Outcome.OUT_OF_REACH), reason, None, None, None, None, ())
 
 
-def _done(planned: PlannedConstraint, point: PointRecord) -> PointDone:
+def _done(planned: PlannedConstraint, point: PointRecord) -> ViewDone:
     captured = point.capture is not None
-    return PointDone(planned.use, planned.name, 0, 1, point.outcome, captured, point.frames, None, point.reason)
+    return ViewDone(planned.use, planned.name, 0, 1, point.outcome, captured, point.frames, None, point.reason)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
@@ -13,12 +13,13 @@ from dualcal_hal.config import CellConfig
 from dualcal_hal.errors import FormatError, UsageError
 from dualcal_hal.session.captures import Captures, CellShape, read_captures
 from dualcal_hal.session.folder import Session
-from dualcal_hal.session.result import Rejected, read_truth, with_truth_error, write_result
+from dualcal_hal.session.result import Rejected, read_truth
 from dualcal_hal.transforms import Array
-from procedures.analysis import Choices, analyse
+from procedures.analysis import Choices
 from procedures.analysis.board_poses import with_corners
 from procedures.calibrate import captures_of, finished
 from procedures.redetection import detect_anew
+from tools.cli.results import analysed, compared, without, write_any
 from tools.cli.show import show_result
 from tools.cli.terminal import Screen
 from tools.cli.triples import TriplesOptions, estimate_from_triples, holds_triples
@@ -66,18 +67,17 @@ def estimate_captures(options: EstimateOptions) -> None:
         console.print(
             f"warning: the captures were taken with another cell file than {_cell_path(options)}", style="yellow"
         )
-    result = analyse(captures, file.cell, options.method or file.cell.procedure.method, _choices(options))
+    result = analysed(captures, file.cell, options.method or file.cell.procedure.method, _choices(options))
     if unfinished:
         said = f"{len(unfinished)} captures left out, the first {unfinished[0].id}: {unfinished[0].reason}"
-        rejected = (*result.captures_rejected, *unfinished)
-        result = replace(result, captures_rejected=rejected, reasons=(*result.reasons, said))
+        result = without(result, unfinished, said)
     folder = options.captures if options.captures.is_dir() else options.captures.parent
-    truth = _truth(options.truth, file if ours else None, folder)
+    truth = _truth(options.truth, file, folder, ours=ours)
     if truth is not None:
-        result = with_truth_error(result, truth)
+        result = compared(result, truth)
     if options.out is not None:
         try:
-            write_result(options.out, result)
+            write_any(options.out, result)
         except OSError as error:
             raise UsageError(f"{options.out}: cannot be written: {error.strerror}") from error
     show_result(console, file.cell, result, truth, as_json=options.json)
@@ -208,7 +208,7 @@ def _detected_anew(
     return anew.captures, anew.missed
 
 
-def _truth(path: Path | None, file: CellFile | None, folder: Path) -> Mapping[str, Array] | None:
+def _truth(path: Path | None, file: CellFile, folder: Path, *, ours: bool) -> Mapping[str, Array] | None:
     if path is not None:
-        return read_truth(path)
-    return None if file is None else simulated_truth(file, folder)
+        return read_truth(path) if file.one_arm is None else read_truth(path, file.one_arm.names)
+    return simulated_truth(file, folder) if ours else None

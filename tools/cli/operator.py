@@ -15,7 +15,8 @@ from rich.console import Console
 
 from procedures.events import LooksProposed, PlanReady
 from procedures.intrinsics.procedure import ViewsProposed
-from procedures.report import plan_table, posture_table, way_table
+from procedures.one_arm.procedure import ViewsReady
+from procedures.report import plan_table, posture_table, views_table, way_table
 
 _POLL = 0.1  # s between two looks whether the run was aborted
 
@@ -61,6 +62,10 @@ class Operator:
                     self._console.print("The way there:")
                     self._console.print(way_table(way))
                 return f"Both arms will move there, and take {count} looks by moves of their wrists. Go on?"
+            case ViewsReady(plan):
+                self._console.print("The plan:")
+                self._console.print(views_table(plan))
+                return "The arm will move by this plan. Go on?"
             case PlanReady(plan):
                 self._console.print("The plan:")
                 self._console.print(plan_table(plan))

@@ -33,12 +33,11 @@ from dualcal_hal.session.journal import Journal, StepKey
 from dualcal_hal.session.log import LogReader
 from dualcal_hal.session.log.attempts import FinishedAttempts, begun_segments
 from dualcal_hal.session.log.records import RecordedError
-from dualcal_hal.session.result import Result, read_result
-from procedures.calibrate import Calibration, captures_of
-from procedures.planning.model import CellModel
+from procedures.calibrate import captures_of
 from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.intrinsics import replay_intrinsics
-from tools.cli.run import analyse_session, execute, write_session_captures
+from tools.cli.results import AnyResult, read_any
+from tools.cli.run import analyse_session, calibration_of, execute, write_session_captures
 from tools.cli.terminal import Screen
 from tools.cli.truth import told_truth
 
@@ -63,7 +62,7 @@ class Replayed:
     served: whether detections were not worked out anew, because images were recorded with loss.
     """
 
-    result: Result | None
+    result: AnyResult | None
     ended: str
     otherwise: str
     recorded_time: float
@@ -126,12 +125,12 @@ def _session(out: Path | None, cell_text: str) -> Iterator[Session]:
 
 
 def _replay(recorded: Path, file: CellFile, session: Session) -> Replayed:
-    expected = read_result(recorded / "result.json") if (recorded / "result.json").exists() else None
+    expected = read_any(recorded / "result.json", file.cell) if (recorded / "result.json").exists() else None
     segments = begun_segments(recorded)
     log, journal = FinishedAttempts(segments), Journal(recorded / "journal.jsonl")
     _require_all_steps(recorded, log, journal)
     conduct = read_conduct(Session(recorded))
-    cell, calibration = Cell(file, conduct.pace), Calibration(file.cell, CellModel(file.cell))
+    cell, calibration = Cell(file, conduct.pace), calibration_of(file.cell)
     begun = perf_counter()
     result, error = None, None
     try:
@@ -141,7 +140,7 @@ def _replay(recorded: Path, file: CellFile, session: Session) -> Replayed:
         compared = expected is not None and expected.truth_error is not None
         analyse_session(file, session, captures, told_truth(file) if compared else None)
         # Read as the recorded one is: what is compared is what the files say.
-        result = read_result(session.result_path)
+        result = read_any(session.result_path, file.cell)
     except _NO_END_OF_A_RUN:
         raise
     except DualcalError as raised:

@@ -19,7 +19,7 @@ from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import CellFile, differences, load_cell, standing_alone
 from dualcal_hal.clock import utc_now
 from dualcal_hal.commissioning import Commissioning
-from dualcal_hal.config import CellConfig
+from dualcal_hal.config import CellConfig, OneArmCell
 from dualcal_hal.errors import FormatError, NotConfirmed, Problem, UsageError
 from dualcal_hal.pace import REDUCED_SPEED, Pace
 from dualcal_hal.session.captures import CaptureRecord, Captures, CellShape, write_captures
@@ -29,23 +29,25 @@ from dualcal_hal.session.folder import CELL_FILE, Session
 from dualcal_hal.session.lock import SessionLock
 from dualcal_hal.session.log import next_segment
 from dualcal_hal.session.log.recording import LogRecording, Recording
-from dualcal_hal.session.result import Result, read_result, with_truth_error, write_result
+from dualcal_hal.session.one_arm_result import OneArmResult
 from dualcal_hal.transforms import Array
 from procedures.alignment import largest_alignment_error, tolerance_px
-from procedures.analysis import analyse
 from procedures.calibrate import Calibration, captures_of, is_complete
 from procedures.engine import Confirmation, Engine
 from procedures.observers import Observer, Observers
+from procedures.one_arm.procedure import OneArmCalibration
+from procedures.one_arm.rehearsal import rehearse_views
 from procedures.planning.model import CellModel
 from procedures.planning.plan import PLAN_FORMAT, Plan
 from procedures.rehearsal import rehearse, require_reach
-from procedures.report import draw_plan, draw_summary
+from procedures.report import draw_one_arm, draw_plan, draw_summary
 from procedures.steps import Procedure
 from tools.cli.emulator import emulator
 from tools.cli.exits import FAULT, signals_deferred
 from tools.cli.operator import Operator
 from tools.cli.progress import progress
-from tools.cli.show import show_rehearsal, show_result
+from tools.cli.results import AnyResult, analysed, compared, read_any, write_any
+from tools.cli.show import show_rehearsal, show_rehearsed_views, show_result
 from tools.cli.terminal import Screen, plain
 from tools.cli.truth import simulated_truth
 
@@ -94,14 +96,19 @@ def run_cell(options: RunOptions) -> int:
     if options.cell is None:
         raise UsageError("name a cell file, or with --resume a session to go on with")
     file = load_asked(options, options.cell)
-    model = CellModel(file.cell)
-    calibration = Calibration(file.cell, model)
+    calibration = calibration_of(file.cell)
     cell = cell_at_pace(options, file, options.cell)
-    _warn_of_alignment_error(console, file, model)
-    if options.dry_run:
-        _rehearse(console, file, model, options)
-        return 0
-    require_reach(file.cell, model)
+    if isinstance(file.cell, OneArmCell):
+        if options.dry_run:
+            _rehearse_views(console, file, file.cell, options)
+            return 0
+    else:
+        model = CellModel(file.cell)
+        _warn_of_alignment_error(console, file, model)
+        if options.dry_run:
+            _rehearse(console, file, model, options)
+            return 0
+        require_reach(file.cell, model)
     commissioning = commissioned(cell, options, file, options.cell)
     started = utc_now()
     text, copies = standing_alone(file)
@@ -113,10 +120,15 @@ def run_cell(options: RunOptions) -> int:
             commissioning.copy_beside(session.cell_path)
         if text != file.text:
             file = load_cell(session.cell_path)
-            calibration = Calibration(file.cell, CellModel(file.cell))
+            calibration = calibration_of(file.cell)
             cell = Cell(file, cell.pace)
         result = _finish(console, options, file, cell, calibration, session)
         return _report(console, options, file, session, result, commissioning)
+
+
+def calibration_of(cell: CellConfig) -> Stepping:
+    """The procedure of a cell with two arms, or with one."""
+    return OneArmCalibration(cell) if isinstance(cell, OneArmCell) else Calibration(cell, CellModel(cell))
 
 
 def _procedure(options: RunOptions) -> str:
@@ -135,7 +147,7 @@ def _resume(console: Console, options: RunOptions, folder: Path) -> int:
         raise UsageError("--resume goes on in the session's own folder: it takes neither --out nor --dry-run")
     file = file_of(options, folder)
     if (session := Session(folder)).result_path.exists() and _is_finished(file, session):
-        return _report(console, options, file, session, read_result(session.result_path))
+        return _report(console, options, file, session, read_any(session.result_path, file.cell))
     with SessionLock(folder) as lock:
         if lock.left_by is not None:
             say_line(console, f"{folder}: taken over from {lock.left_by}, which has ended without giving it back")
@@ -150,8 +162,7 @@ def _resume(console: Console, options: RunOptions, folder: Path) -> int:
                 result = conclude(file, session, captures, lambda line: say_line(console, line))
                 commissioning = None
             else:
-                model = CellModel(file.cell)
-                calibration, cell = Calibration(file.cell, model), cell_at_pace(options, file, session.cell_path)
+                calibration, cell = calibration_of(file.cell), cell_at_pace(options, file, session.cell_path)
                 commissioning = commissioned(cell, options, file, session.cell_path)
                 keep_conduct(session, Conduct(cell.pace, options.emulate))
                 result = _finish(console, options, file, cell, calibration, session)
@@ -178,8 +189,8 @@ def _is_finished(file: CellFile, session: Session) -> bool:
 
 
 def _finish(
-    console: Console, options: RunOptions, file: CellFile, cell: Cell, calibration: Calibration, session: Session
-) -> Result:
+    console: Console, options: RunOptions, file: CellFile, cell: Cell, calibration: Stepping, session: Session
+) -> AnyResult:
     """Run from where the session's journal ends, and analyse."""
     go_on_from_journal(cell, session)
     with recording_of(options, session, file, cell) as recording, devices(options, cell, session):
@@ -215,7 +226,7 @@ def _report(
     options: RunOptions,
     file: CellFile,
     session: Session,
-    result: Result,
+    result: AnyResult,
     commissioning: Commissioning | None = None,
 ) -> int:
     """Show what came of it; a calibration that was verified is kept in the cell's commissioning."""
@@ -226,7 +237,8 @@ def _report(
     if commissioning is not None and result.verdict == "ok":
         commissioning.record_verified(f"verdict {result.verdict} of session {session.folder.name}")
     if (distances := read_distances(session)) is not None:
-        say_line(console, f"least distance between the arms {distances.least()}")
+        between = "between the arms" if file.one_arm is None else "between arm and stand"
+        say_line(console, f"least distance {between} {distances.least()}")
     say_line(console, f"session: {session.folder}")
     return 0 if result.verdict == "ok" else FAULT
 
@@ -256,7 +268,7 @@ def recording_of(options: RunOptions, session: Session, file: CellFile, cell: Ce
 
 
 def _run(
-    console: Console, options: RunOptions, file: CellFile, cell: Cell, calibration: Calibration, session: Session
+    console: Console, options: RunOptions, file: CellFile, cell: Cell, calibration: Stepping, session: Session
 ) -> Captures:
     """The run itself; its captures are written however it ends."""
     with signals_deferred() as signals:
@@ -297,11 +309,27 @@ def _rehearse(console: Console, file: CellFile, model: CellModel, options: RunOp
     console.print(f"plan and picture: {session.folder}", soft_wrap=True, highlight=False)
 
 
+def _rehearse_views(console: Console, file: CellFile, cell: OneArmCell, options: RunOptions) -> None:
+    """The same of a cell with one arm; its plan can be kept."""
+    rehearsed = rehearse_views(cell)
+    show_rehearsed_views(console, cell, rehearsed, as_json=options.json)
+    if options.out is None:
+        console.print("With --out FOLDER the plan is written there.")
+        return
+    session = Session.create(options.out, file.text)
+    if rehearsed.plan is not None:
+        session.write_document(PLAN_FILE, rehearsed.plan.to_record())
+    console.print(f"plan: {session.folder}", soft_wrap=True, highlight=False)
+
+
 def load_asked(options: RunOptions, path: Path) -> CellFile:
     """The cell file with what the command line sets in it."""
     overrides = list(options.overrides)
     if options.method is not None:
-        overrides.append(f"procedure.method={options.method}")
+        if load_cell(path, overrides).one_arm is None:
+            overrides.append(f"procedure.method={options.method}")
+        elif options.method != "refined":
+            raise UsageError(f"--method {options.method} needs two arms; a cell with one is for method refined")
     if options.seed is not None:
         overrides.append(f"procedure.seed={options.seed}")
         if load_cell(path, options.overrides).simulation is not None:
@@ -374,7 +402,7 @@ def _write_documents(cell: Cell, session: Session, earlier: Distances | None) ->
 
 def conclude(
     file: CellFile, session: Session, captures: Captures, say: Callable[[str], None] = lambda line: None
-) -> Result:
+) -> AnyResult:
     """Analyse, and only then compare with the truth where there is one; write both and the picture.
 
     ``say`` gets a line for each part of the picture that cannot be drawn, as a file of the session is missing.
@@ -382,6 +410,10 @@ def conclude(
     result = analyse_session(file, session, captures, simulated_truth(file, session.folder))
     shown = captures.captures[0]
     image, plan = _image_of(session, shown, say), None
+    if isinstance(result, OneArmResult):
+        assert isinstance(file.cell, OneArmCell)
+        draw_one_arm(session.summary_path, file.cell.one_arm, captures.captures, result, image)
+        return result
     if (session.folder / PLAN_FILE).exists():
         plan = _read_plan(session, file.cell)
     else:
@@ -417,12 +449,14 @@ def _read_plan(session: Session, cell: CellConfig) -> Plan:
     return plan
 
 
-def analyse_session(file: CellFile, session: Session, captures: Captures, truth: Mapping[str, Array] | None) -> Result:
+def analyse_session(
+    file: CellFile, session: Session, captures: Captures, truth: Mapping[str, Array] | None
+) -> AnyResult:
     """The result, with its error where there is a truth, written to the session."""
-    result = analyse(captures, file.cell, file.cell.procedure.method)
+    result = analysed(captures, file.cell, file.cell.procedure.method)
     if truth is not None:
-        result = with_truth_error(result, truth)
-    write_result(session.result_path, result)
+        result = compared(result, truth)
+    write_any(session.result_path, result)
     return result
 
 

@@ -9,20 +9,21 @@ import typer
 from rich.console import Console
 
 from dualcal_hal.config import CellConfig
-from dualcal_hal.session.result import Result
 from dualcal_hal.transforms import Array
+from procedures.one_arm.rehearsal import RehearsedViews
 from procedures.rehearsal import Rehearsal
-from procedures.report import plan_table, result_tables, way_table
+from procedures.report import plan_table, views_table, way_table
+from tools.cli.results import AnyResult, tables_of
 
 
 def show_result(
-    console: Console, cell: CellConfig, result: Result, truth: Mapping[str, Array] | None, *, as_json: bool
+    console: Console, cell: CellConfig, result: AnyResult, truth: Mapping[str, Array] | None, *, as_json: bool
 ) -> None:
     """Tables for a person, or the document alone for a program."""
     if as_json:
         typer.echo(json.dumps(result.to_document(), indent=1, allow_nan=False))
     else:
-        console.print(result_tables(cell, result, truth))
+        console.print(tables_of(cell, result, truth))
 
 
 def show_rehearsal(console: Console, cell: CellConfig, rehearsal: Rehearsal, *, as_json: bool) -> None:
@@ -54,3 +55,21 @@ def show_rehearsal(console: Console, cell: CellConfig, rehearsal: Rehearsal, *, 
         return
     console.print("Provisional: the run plans anew after its looks." if rehearsal.stand_off else "From the nominal:")
     console.print(plan_table(rehearsal.plan))
+
+
+def show_rehearsed_views(console: Console, cell: CellConfig, rehearsed: RehearsedViews, *, as_json: bool) -> None:
+    """The looks and the provisional plan of a cell with one arm; the plan alone (or null) for a program."""
+    if as_json:
+        typer.echo(json.dumps(None if rehearsed.plan is None else rehearsed.plan.to_record(), indent=1))
+        return
+    console.print(f"Dry run of cell '{cell.name}': no device is opened.")
+    if rehearsed.looks is not None:
+        looks = f"{cell.procedure.first_looks} first looks, from as many of these as it takes:"
+        console.print(looks)
+        console.print(views_table(rehearsed.looks))
+    if rehearsed.plan is None:
+        console.print(f"There is no provisional plan from the nominal transforms ({rehearsed.no_plan}).")
+        console.print("The run plans after its looks, with better transforms.")
+        return
+    console.print("Provisional: the run plans anew after its looks." if rehearsed.looks else "From the nominal:")
+    console.print(views_table(rehearsed.plan))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dualcal_hal import registry
 from dualcal_hal.cellfile import CellFile, load_cell
+from dualcal_hal.config import StandTruthConfig
 from dualcal_hal.errors import UsageError
 from dualcal_hal.session.conduct import read_conduct
 from dualcal_hal.session.folder import CELL_FILE, Session
@@ -29,12 +30,15 @@ def told_truth(file: CellFile) -> Mapping[str, Array] | None:
     """The true transforms that a cell file tells, None if it tells none; whoever asks knows that it was simulated."""
     if file.simulation is None:
         return None
-    return {T_P_A_NAME: file.simulation.truth.T_P_A, T_H_E_NAME: file.simulation.truth.T_H_E}
+    truth = file.simulation.truth
+    if file.one_arm is not None and isinstance(truth, StandTruthConfig):
+        return dict(zip(file.one_arm.names, (truth.transforms.camera, truth.transforms.target), strict=True))
+    return {T_P_A_NAME: truth.T_P_A, T_H_E_NAME: truth.T_H_E}
 
 
 def _is_simulated(file: CellFile) -> bool:
     cell = file.cell
-    used = [cell.backends[name] for name in {cell.active.backend, cell.passive.backend, cell.camera.backend}]
+    used = [cell.backends[name] for name in {*(arm.backend for arm in cell.arms.values()), cell.camera.backend}]
     try:
         return all(
             _was_simulated(Path(entry.options["session"]))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from dualcal_hal.cell import Cell
-from dualcal_hal.cellfile import load_cell
+from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.errors import DegenerateCaptures, DeviceError, NoPlan
 from dualcal_hal.session.folder import Session
+from dualcal_hal.session.result import Result
 from procedures.calibrate import Calibration, captures_of
 from procedures.events import PointDone
 from procedures.planning.model import CellModel
@@ -57,19 +58,26 @@ def attempt(path: Path, seed: int, overrides: list[str]) -> Run | Ended:
         return Ended(seed, f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
-def run(path: Path, seed: int, overrides: list[str]) -> Run:
-    """A whole run with both seeds set, in a folder that is thrown away; DegenerateCaptures if nothing verifies it."""
+def calibrated(
+    path: Path, seed: int, overrides: list[str], observe: Callable[[object], None] = lambda event: None
+) -> tuple[CellFile, Result]:
+    """The result of a whole run with both seeds set, in a folder that is thrown away."""
     file = load_cell(path, [*overrides, f"procedure.seed={seed}", f"simulation.seed={seed}"])
+    with tempfile.TemporaryDirectory() as folder:
+        session = Session.create(Path(folder) / "session", file.text)
+        execute(Cell(file), Calibration(file.cell, CellModel(file.cell)), session, observe)
+        return file, conclude(file, session, captures_of(session.journal, file.sha256, None))
+
+
+def run(path: Path, seed: int, overrides: list[str]) -> Run:
+    """The figures of a whole run; DegenerateCaptures if nothing verifies it."""
     points: list[PointDone] = []
 
     def collect(event: object) -> None:
         if isinstance(event, PointDone):
             points.append(event)
 
-    with tempfile.TemporaryDirectory() as folder:
-        session = Session.create(Path(folder) / "session", file.text)
-        execute(Cell(file), Calibration(file.cell, CellModel(file.cell)), session, collect)
-        result = conclude(file, session, captures_of(session.journal, file.sha256, None))
+    _, result = calibrated(path, seed, overrides, collect)
     constraints = list(dict.fromkeys(point.constraint for point in points))
     if result.mismatch_after is None:
         raise DegenerateCaptures("; ".join(result.reasons))

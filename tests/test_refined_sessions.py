@@ -30,7 +30,7 @@ GOOD = Run(
 
 
 def test_a_seed_is_a_row_with_its_largest_error_and_verdict() -> None:
-    assert row(GOOD).split() == "7 11.0 2.50 P_A ty 0.020 0.0030 0.040 0.060 1.0 0.4 ok".split()
+    assert " ".join(row(GOOD).split()) == "7 11.0 2.50 P_A ty 0.020 0.0030 0.040 0.060 1.0 0.4 ok"
     assert row(replace(GOOD, errors=GOOD.errors[::-1])).split()[2:5] == ["2.50", "H_E", "ry"]
 
 

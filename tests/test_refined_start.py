@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import Array, inverse, rotation_from_vector, transform
 from procedures.estimation import Degenerate
 from procedures.estimation.refined.closed_form import solve
@@ -121,6 +122,7 @@ def turned_to(turns: Array, shifts: Array | None = None, seed: int = 0, most_til
     """
     cell, rng = reference(), np.random.default_rng(seed)
     chain, first = cell.knowns.active, cell.data.active[0]
+    assert isinstance(chain, Chain)
     shifts = rng.uniform(-0.03, 0.03, (len(turns), 3)) if shifts is None else shifts
     T_A_E = moved(chain.forward(first) @ cell.T_H_E, np.concatenate([shifts, turns], axis=1))
     active, reached = chain.inverse(T_A_E @ inverse(cell.T_H_E), np.tile(first, (len(turns), 1)), *LIMITS.T)

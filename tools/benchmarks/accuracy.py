@@ -16,7 +16,7 @@ import numpy as np
 
 from dualcal_hal.cell import Cell
 from dualcal_hal.cellfile import CellFile, load_cell
-from dualcal_hal.errors import DegenerateCaptures, DeviceError, NoPlan
+from dualcal_hal.errors import DegenerateCaptures, DeviceError, NoPlan, UsageError
 from dualcal_hal.session.folder import Session
 from dualcal_hal.session.result import Result
 from procedures.calibrate import Calibration, captures_of
@@ -66,7 +66,10 @@ def calibrated(
     with tempfile.TemporaryDirectory() as folder:
         session = Session.create(Path(folder) / "session", file.text)
         execute(Cell(file), Calibration(file.cell, CellModel(file.cell)), session, observe)
-        return file, conclude(file, session, captures_of(session.journal, file.sha256, None))
+        result = conclude(file, session, captures_of(session.journal, file.sha256, None))
+    if not isinstance(result, Result):
+        raise UsageError(f"{path}: one arm alone has no base of another to be found")
+    return file, result
 
 
 def run(path: Path, seed: int, overrides: list[str]) -> Run:

@@ -129,13 +129,18 @@ def _sigma(likelihood: _Likelihood, best: Array, axis: int, unit: float) -> Sigm
 
     def rise(logarithm: float) -> float:
         """Over the best, with the other sigma as it then fits best."""
+
+        def with_other(x: float) -> float:
+            return likelihood(np.array([logarithm, x] if axis == 0 else [x, logarithm]))
+
         found = optimize.minimize_scalar(
-            lambda x: likelihood(np.array([logarithm, x] if axis == 0 else [x, logarithm])),
+            with_other,
             bounds=(max(other - 1, _LOWEST), min(other + 1, _HIGHEST)),
             method="bounded",
             options={"xatol": 1e-2},
         )
-        return float(found.fun) - least
+        # The search may end in another valley than that of the best.
+        return min(float(found.fun), with_other(other)) - least
 
     value = float(best[axis])
     identified = rise(_LOWEST) > _IDENTIFIED

@@ -22,16 +22,17 @@ from dualcal_hal.session.views_result import (
     ViewResult,
     ViewsResult,
 )
+from dualcal_hal.target import Checkerboard
 from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.detection import Detection, Detector, Missed
 from procedures.estimation import Degenerate
 from procedures.estimation.refined.as_read import fit_as_read
 from procedures.estimation.refined.breakdown import FREE_LENS, break_down
+from procedures.estimation.refined.data import Indices
 from procedures.estimation.refined.inexact import Inexact
 from procedures.estimation.refined.left_out import LeftOut, leave_one_out
 from procedures.estimation.refined.motion import logarithm
 from procedures.estimation.refined.one_arm import FlangePoses, OneArm, Placement, Views, one_arm
-from procedures.estimation.refined.uncertainty import Limits, directions
 from procedures.views_verdict import verdict_of
 
 PIXEL = 0.1
@@ -39,6 +40,7 @@ PIXEL = 0.1
 TRANSLATION, ROTATION = 1e-3, 1e-3
 """m and rad: of a flange pose, as long as none is found; what is found keeps their ratio."""
 
+_MOST_FOR_PLACEMENT = 24  # views that are asked for it
 _ROUGH_PIXEL = 1.0  # px: of the first fit
 _LEAST_PIXEL, _LEAST_ROTATION = 0.01, 1e-5  # px and rad, from where noise is sought
 _TELLS = 3.0  # times that the corners must be farther off with the other placement
@@ -131,11 +133,11 @@ def _read_image(view: View) -> Image:
 
 def analyse_views(file: ViewsFile, seen: Seen, choices: ViewsChoices) -> ViewsResult:
     """Estimate from what was found in the images; DegenerateCaptures for views that do not determine the transforms."""
-    views = _views(file, seen, choices.noise)
+    views = _views(file, seen)
     try:
-        placement, rough = _placed(file, views)
+        placement, views, rough = _placed(file, views)
         if choices.keep_all:
-            rough = replace(rough, used=views.seen.any(axis=1), dropped=())
+            rough = replace(rough, used=np.asarray(np.any(views.seen, axis=1)), dropped=())
         fits = dict(_fits(views, file.flanges, rough, choices))
         left_out = {name: leave_one_out(views, fit, choices.inexact) for name, fit in fits.items()}
     except Degenerate as error:
@@ -147,7 +149,7 @@ def analyse_views(file: ViewsFile, seen: Seen, choices: ViewsChoices) -> ViewsRe
     if not choices.free_intrinsics and _lens_is_off(residue):
         fit, moved = _reckoned_with_lens(views, rough, fit)
     scale = 1.0 if choices.estimate_noise else fit.scale
-    result = _result(file, seen, choices, placement, fit, left_out[best], residue)
+    result = _result(file, seen, choices, placement, views, fit, left_out[best], residue)
     result = replace(result, attempts=attempts, moved_by_lens=moved)
     verdict, reasons = verdict_of(result, scale)
     return replace(result, verdict=verdict, reasons=reasons)
@@ -200,17 +202,11 @@ def _reckoned_with_lens(views: Views, rough: OneArm, fit: OneArm) -> tuple[OneAr
         return fit, None
     off = np.concatenate([logarithm(fit.camera, freed.camera), logarithm(fit.target, freed.target)])
     of_lens = np.outer(off, off)
-    covariance = fit.covariance + of_lens
-    fit = replace(
-        fit,
-        covariance=covariance,
-        directions=directions(covariance, Limits(), ("camera", "target")),
-        contributions={**fit.contributions, "lens": of_lens},
-    )
+    fit = replace(fit, covariance=fit.covariance + of_lens, contributions={**fit.contributions, "lens": of_lens})
     return fit, float(np.linalg.norm(freed.camera[:3, 3] - fit.camera[:3, 3]))
 
 
-def _views(file: ViewsFile, seen: Seen, noise: StatedNoise) -> Views:
+def _views(file: ViewsFile, seen: Seen) -> Views:
     corners = len(file.board.corners)
     nothing = np.full((corners, 2), np.nan)
     pixels = np.stack([found.corners if isinstance(found, Detection) else nothing for found in seen.outcomes])
@@ -219,7 +215,7 @@ def _views(file: ViewsFile, seen: Seen, noise: StatedNoise) -> Views:
         # Turned by half a turn in all views it is the same board: the best one seen says which way up it is.
         order_known[np.argmax(np.isfinite(pixels[..., 0]).sum(axis=1))] = True
     return Views(
-        arm=FlangePoses(file.flanges, noise.translation, noise.rotation),
+        arm=FlangePoses(file.flanges, TRANSLATION, ROTATION),
         pixels=pixels,
         corners=file.board.corners,
         matrix=file.intrinsics.matrix,
@@ -228,31 +224,63 @@ def _views(file: ViewsFile, seen: Seen, noise: StatedNoise) -> Views:
     )
 
 
-def _placed(file: ViewsFile, views: Views) -> tuple[PlacementFound, OneArm]:
-    """As the file states it, else the one with which the corners are far less off; with a first fit, whose noise is so
-    large that a wrong lens makes no view doubtful.
+def _placed(file: ViewsFile, views: Views) -> tuple[PlacementFound, Views, OneArm]:
+    """As the file states it, else the one with which the corners are far less off; the views with their corners in
+    order, and a first fit whose noise is so large that a wrong lens makes no view doubtful.
     """
-    stated = () if file.placement is None else (Placement(file.placement),)
-    fits: dict[Placement, OneArm] = {}
+    if file.placement is not None:
+        return PlacementFound(file.placement, True, None), *_first_fit(file, views, Placement(file.placement))
+    some = _only(views, np.unique(np.linspace(0, len(views) - 1, _MOST_FOR_PLACEMENT).astype(int)))
+    off: dict[Placement, float] = {}
     reasons: dict[Placement, Degenerate] = {}
-    begun = replace(views, arm=FlangePoses(file.flanges, TRANSLATION, ROTATION))
-    for placement in stated or Placement:
+    for placement in Placement:
         try:
-            fits[placement] = one_arm(begun, placement, _ROUGH_PIXEL)
+            off[placement] = _typically_off(_first_fit(file, some, placement)[1])
         except Degenerate as error:
             reasons[placement] = error
-    if not fits:
+    if not off:
         raise next(iter(reasons.values()))
-    best, *others = sorted(fits, key=lambda placement: _typically_off(fits[placement]))
-    if not others:
-        return PlacementFound(best.value, bool(stated), None), fits[best]
-    ratio = _typically_off(fits[others[0]]) / _typically_off(fits[best])
-    if ratio < _TELLS:
+    best, *others = sorted(off, key=lambda placement: off[placement])
+    ratio = off[others[0]] / off[best] if others else None
+    if ratio is not None and ratio < _TELLS:
         raise Degenerate(
             "whether the camera is on the arm or stays beside it does not show; write "
             f'"placement": "{Placement.ON_ARM}" or "{Placement.FIXED}" into the file'
         )
-    return PlacementFound(best.value, False, ratio), fits[best]
+    return PlacementFound(best.value, False, ratio), *_first_fit(file, views, best)
+
+
+def _first_fit(file: ViewsFile, views: Views, placement: Placement) -> tuple[Views, OneArm]:
+    board = file.board
+    if isinstance(board, Checkerboard) and board.rows == board.columns:
+        views = _by_quarters(views, board.rows, placement)
+    return views, one_arm(views, placement, _ROUGH_PIXEL)
+
+
+def _by_quarters(views: Views, side: int, placement: Placement) -> Views:
+    """With the corners of a square board listed from the same side in all views.
+
+    Each view is taken twice, as it is and turned by a quarter, but for the one that says where the first side is; those
+    that agree with each other are the ones in order.
+    """
+    listed = views.pixels.reshape(len(views), side, side, 2)
+    turned = replace(views, pixels=np.rot90(listed, axes=(1, 2)).reshape(views.pixels.shape))
+    first = int(np.argmax(views.seen.sum(axis=1)))
+    twice = np.concatenate([np.arange(len(views)), np.delete(np.arange(len(views)), first)])
+    both = _only(views, twice)
+    both.pixels[len(views) :] = turned.pixels[twice[len(views) :]]
+    fit = one_arm(both, placement, _ROUGH_PIXEL)
+    fits = np.delete(fit.used[: len(views)], first) < fit.used[len(views) :]
+    better = np.zeros(len(views), dtype=bool)
+    better[twice[len(views) :]] = fits
+    return replace(views, pixels=np.where(better[:, None, None], turned.pixels, views.pixels))
+
+
+def _only(views: Views, chosen: Indices) -> Views:
+    assert isinstance(views.arm, FlangePoses)
+    assert views.order_known is not None
+    arm = replace(views.arm, flange=views.arm.flange[chosen])
+    return replace(views, arm=arm, pixels=views.pixels[chosen], order_known=views.order_known[chosen])
 
 
 def _typically_off(fit: OneArm) -> float:
@@ -273,6 +301,7 @@ def _result(
     seen: Seen,
     choices: ViewsChoices,
     placement: PlacementFound,
+    views: Views,
     fit: OneArm,
     left_out: LeftOut,
     residue: Residue,
@@ -301,7 +330,7 @@ def _result(
         camera_error=_predicted(fit, np.zeros(3)),
         point_error=_predicted(fit, _middle(file, fit)),
         moved_by_lens=None,
-        views=tuple(_view_results(file, seen, fit, left_out)),
+        views=tuple(_view_results(file, seen, views, fit, left_out)),
         intrinsics_given=given,
         distortion_known=file.distortion_known,
         intrinsics=Intrinsics(fit.matrix, fit.distortion, seen.size),
@@ -326,22 +355,18 @@ def _predicted(fit: OneArm, point: Array) -> Predicted:
     return Predicted(float(error.rms), float(error.p95))
 
 
-def _view_results(file: ViewsFile, seen: Seen, fit: OneArm, left_out: LeftOut) -> Iterator[ViewResult]:
+def _view_results(file: ViewsFile, seen: Seen, views: Views, fit: OneArm, left_out: LeftOut) -> Iterator[ViewResult]:
     dropped = {drop.capture: drop.reason for drop in fit.dropped}
     pixels, metres = left_out.rms()
     distances = np.sqrt(fit.distances / np.maximum(fit.freedoms, 1))
-    nothing = np.full((len(file.board.corners), 2), np.nan)
     for k, (view, found) in enumerate(zip(file.views, seen.outcomes, strict=True)):
         missed = str(found) if isinstance(found, Missed) else None
-        corners = nothing
-        if isinstance(found, Detection):
-            corners = found.corners[::-1] if fit.flipped[k] else found.corners
         yield ViewResult(
             name=view.name,
             image=str(view.image),
             missed=missed,
             dropped=None if missed else dropped.get(k),
-            corners=corners,
+            corners=views.pixels[k, ::-1] if fit.flipped[k] else views.pixels[k],
             residuals=fit.residuals[k],
             left_out_px=float(pixels[k]),
             left_out=float(metres[k]),

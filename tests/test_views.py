@@ -142,6 +142,16 @@ class TestRendered:
         assert_near(way, IN_BASE)
         assert not any("second solution" in warning for warning in document["warnings"])
 
+    @pytest.mark.slow
+    @pytest.mark.parametrize("side", [3, 4])
+    def test_a_square_checkerboard_is_read_from_the_same_side_in_all_views(self, tmp_path: Path, side: int) -> None:
+        board = Checkerboard(side, side, 0.025, (side - 1) // 2 * (side + 1))
+        document = estimated(photographed(tmp_path, board, "eye-to-hand"))
+        assert all(view["used"] for view in document["views"])
+        assert_near(matrix(document, "camera_in_base"), IN_BASE)
+        assert document["residuals"]["rms_px"] < 0.05
+
+    @pytest.mark.slow
     def test_the_placement_may_be_stated_and_a_wrong_one_explains_nothing(
         self, changed: Callable[[Change], Path]
     ) -> None:
@@ -167,6 +177,7 @@ class TestRendered:
         assert all(view["used"] for view in kept["views"])
         assert kept["verdict"] == "fail"
 
+    @pytest.mark.slow
     def test_an_image_without_the_target_is_named_and_the_rest_is_used(
         self, changed: Callable[[Change], Path], tmp_path: Path
     ) -> None:
@@ -177,6 +188,7 @@ class TestRendered:
         assert document["views"][2]["rms_px"] is None
         assert_near(matrix(document, "camera_in_base"), IN_BASE)
 
+    @pytest.mark.slow
     def test_a_part_of_the_board_is_enough(
         self, fixed: Path, changed: Callable[[Change], Path], tmp_path: Path
     ) -> None:
@@ -203,6 +215,7 @@ class TestRendered:
         assert abs(found["matrix"][0][0] - CAMERA.matrix[0, 0]) < 4 * sigma["fx"]
         assert document["residuals"]["rms_px"] < 0.05
 
+    @pytest.mark.slow
     def test_stated_noise_that_does_not_fit_fails(self, changed: Callable[[Change], Path]) -> None:
         def shake(document: dict[str, Any]) -> None:
             for number, view in enumerate(document["views"]):
@@ -385,6 +398,7 @@ class TestPhotographs:
         assert 0.005 < moved < 0.012
         assert 1e3 * moved < given["predicted_error"]["camera_position_mm"]["p95"]
 
+    @pytest.mark.slow
     def test_it_needs_no_guess(self, given: dict[str, Any], tmp_path: Path) -> None:
         document = json.loads(ABB.read_text())
         del document["guess"]

@@ -14,7 +14,7 @@ from procedures.estimation.refined.inexact import Inexact
 from procedures.estimation.refined.one_arm import OneArm, Views, as_captures
 from procedures.estimation.refined.refit import both, corners_alone, refit
 
-MOST_FITS = 40
+MOST_FITS = 25
 
 
 @dataclass(frozen=True)

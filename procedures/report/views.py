@@ -103,7 +103,7 @@ def _draw_cloud(axes: Axes, result: ViewsResult) -> None:
     half = 1.15 * float(np.abs(residuals).max())
     axes.plot(*residuals.T, ".", color=BLUE, markersize=5, label=f"{len(residuals)} corners")
     axes.add_patch(Circle((0, 0), result.rms, fill=False, edgecolor=ORANGE, linewidth=2.5))
-    axes.plot([], [], "-", color=ORANGE, linewidth=2.5, label=f"rms per axis {result.rms:.2f} px")
+    axes.plot([], [], "-", color=ORANGE, linewidth=2.5, label=f"rms per axis {result.rms:.2g} px")
     noise = result.residue.corners_free
     if noise is not None:
         axes.add_patch(Circle((0, 0), noise, fill=False, edgecolor=RED, linewidth=2.5))
@@ -119,22 +119,23 @@ def _draw_by_view(axes: Axes, result: ViewsResult) -> None:
     shown = [view for view in result.views if view.seen]
     number = np.arange(len(shown))
     attempt = result.attempts[result.poses]
+    at_foot = axes.get_xaxis_transform()
     for offset, values, colour, words in (
-        (-0.2, [view.rms for view in shown], BLUE, f"residual, {attempt.rms:.2f} px rms over all"),
-        (0.2, [view.left_out_px for view in shown], ORANGE, f"left out, {attempt.left_out_px:.2f} px"),
+        (-0.2, [view.rms for view in shown], BLUE, f"residual, {attempt.rms:.2g} px rms over all"),
+        (0.2, [view.left_out_px for view in shown], ORANGE, f"left out, {attempt.left_out_px:.2g} px"),
     ):
         axes.bar(number + offset, values, 0.38, color=colour, label=words)
     for k, view in enumerate(shown):
         if len(shown) <= MOST_SHOWN:
             axes.annotate(
-                f"{1e3 * view.left_out:.1f}", (k + 0.2, view.left_out_px), ha="center", va="bottom", fontsize=9
+                f"{1e3 * view.left_out:.3g}", (k + 0.2, view.left_out_px), ha="center", va="bottom", fontsize=9
             )
         if not view.used:
-            axes.plot(k, 0, "x", color=RED, markersize=10, markeredgewidth=2.5, clip_on=False)
+            axes.plot(k, 0, "x", color=RED, markersize=10, markeredgewidth=2.5, clip_on=False, transform=at_foot)
     if len(shown) <= MOST_SHOWN:
         axes.plot([], [], " ", label="numbers: left out, mm at the target")
     if any(not view.used for view in shown):
-        axes.plot([], [], "x", color=RED, markeredgewidth=2.5, label="not used")
+        axes.plot([], [], "x", color=RED, markeredgewidth=2.5, linestyle="none", label="not used")
         axes.set_yscale("log")
     step = max(1, len(shown) // MOST_SHOWN)
     axes.set_xticks(number[::step], [_tick(view.name) for view in shown[::step]], rotation=45, ha="right")

@@ -35,6 +35,8 @@ class JointLimits:
         if not path.waypoints:
             return "the path is empty"
         joints = len(self.lower)
+        if not joints:
+            return "it has no joints"
         numbers = [("waypoint", w) for w in path.waypoints]
         for what, values in (*numbers, ("speed", path.speed), ("acceleration", path.acceleration)):
             if len(values) != joints or not np.all(np.isfinite(values)):

@@ -34,6 +34,9 @@ from procedures.estimation.refined.one_arm import OneArm, Placement, Views, as_c
 from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, verify
 from procedures.one_arm.fit import estimate, inexact_of, joint_sigma, placement_of, views_of
 
+_FEWEST_MOVED = 2
+"""Views in a row at either end that are dropped, from where something is said to have moved."""
+
 _COMPONENTS = tuple(f"{what} {axis}" for what in ("translation", "rotation") for axis in "xyz")
 
 
@@ -55,9 +58,20 @@ def analyse_one_arm(captures: Captures, cell: OneArmCell, choices: Choices | Non
     proof = _verification(config, placement, result, verification) if verification else None
     accuracy = _accuracy(config, found, calibration + verification)
     verdict, reasons = _judge(found, proof, accuracy, _off(left_out, found.used))
-    return _result(
-        config, found, calibration, left_out, accuracy, proof, verdict=verdict, reasons=(*reasons, *found.warnings)
-    )
+    reasons = (*reasons, *_moved(found, calibration), *found.warnings)
+    return _result(config, found, calibration, left_out, accuracy, proof, verdict=verdict, reasons=reasons)
+
+
+def _moved(found: OneArm, calibration: Sequence[CaptureRecord]) -> Iterator[str]:
+    """Where it is the last views, or the first, that do not belong to the others."""
+    dropped = np.flatnonzero(~found.used)
+    count, views = len(dropped), len(calibration)
+    if count < _FEWEST_MOVED:
+        return
+    if dropped[0] == views - count:
+        yield f"the views from {calibration[dropped[0]].id} on are elsewhere: target or camera may have moved then"
+    elif dropped[-1] == count - 1:
+        yield f"the views up to {calibration[dropped[-1]].id} are elsewhere: target or camera may have moved then"
 
 
 def _of(captures: Captures, use: str) -> list[CaptureRecord]:

@@ -75,6 +75,8 @@ def run_intrinsics(options: RunOptions) -> int:
     if options.cell is None:
         raise UsageError("name a cell file, or with --resume a session to go on with")
     file = load_asked(options, options.cell)
+    if file.one_arm is not None:
+        raise UsageError("--procedure intrinsics needs two arms: one holds the target before the other's camera")
     IntrinsicsProcedure(file.cell, CellModel(file.cell))  # what it refuses is refused before there is a session
     cell = cell_at_pace(options, file, options.cell)
     commissioning = commissioned(cell, options, file, options.cell)

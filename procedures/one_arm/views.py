@@ -27,8 +27,8 @@ VIEW_SECONDS = 0.1
 
 _BATCH = 300  # poses tried at once
 _BATCHES = 12  # before no more are looked for
-_STARTS = 4  # of the inverse kinematics, for each pose
-_POOL = 6  # candidates for each view
+_STARTS, _ITERATIONS = 3, 15  # of the inverse kinematics, for each pose
+_POOL = 4  # candidates for each view
 _ACROSS = 0.8  # of half the image, within which the feature point is
 _LEVER = 0.5  # m; flanges so far apart count as much as flanges turned by a radian
 _WAYS_MISSED = 16
@@ -168,18 +168,21 @@ class ViewPlanner:
         return transform(R, distance * sight)
 
     def _reach(self, T_E_T: Array) -> tuple[Array, Mask]:
-        """Joint angles (k, n), and which of them bring the flange there: from the start that leads nearest to home."""
+        """Joint angles (k, n), and which of them bring the flange there: from home, else from somewhere at random."""
         arm = self._known.arm
         goals = self._known.flange(T_E_T)
-        starts = random_joints(self._rng, _STARTS * len(goals), arm.lower, arm.upper)
-        starts[::_STARTS] = arm.home
-        q, reached = arm.chain.inverse(np.repeat(goals, _STARTS, axis=0), starts, arm.lower, arm.upper, iterations=30)
-        q = arm.nearest_turn(q, arm.home).reshape(len(goals), _STARTS, -1)
-        reached = reached.reshape(len(goals), _STARTS)
-        far = np.where(reached, np.abs(q - arm.home).max(axis=2), np.inf)
-        best = np.argmin(far, axis=1)
-        each = np.arange(len(goals))
-        return q[each, best], reached[each, best]
+        joints, reached = np.tile(arm.home, (len(goals), 1)), np.zeros(len(goals), dtype=bool)
+        longest = sum(float(np.hypot(row.a, row.d)) for row in arm.chain.rows)
+        within = np.linalg.norm(goals[:, :3, 3], axis=1) <= longest
+        for number in range(_STARTS):
+            left = np.flatnonzero(within & ~reached)
+            starts = random_joints(self._rng, len(left), arm.lower, arm.upper) if number else joints[left]
+            if not len(left):
+                break
+            q, found = arm.chain.inverse(goals[left], starts, arm.lower, arm.upper, iterations=_ITERATIONS)
+            reached[left] = found
+            joints[left[found]] = arm.nearest_turn(q[found], arm.home)
+        return joints, reached
 
     # -- choice -------------------------------------------------------------------------------------------------
 

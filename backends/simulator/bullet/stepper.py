@@ -128,8 +128,8 @@ class BulletStepper(Stepper):
 
     def _has_settled(self, arm: str, q: Array, velocity: Array) -> bool:
         set_points = self._set_points[arm]
-        off = np.max(np.abs(q - set_points.destination))
-        return bool(set_points.end <= self._time and off <= SETTLED and np.max(np.abs(velocity)) <= STILL)
+        off = np.max(np.abs(q - set_points.destination), initial=0.0)
+        return bool(set_points.end <= self._time and off <= SETTLED and np.max(np.abs(velocity), initial=0.0) <= STILL)
 
     def _halt_on_contact(self, joints: Joints) -> None:
         contact = self._nearness.contact({arm: STEP * np.abs(velocity) for arm, (_, velocity) in joints.items()})

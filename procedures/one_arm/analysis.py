@@ -58,20 +58,22 @@ def analyse_one_arm(captures: Captures, cell: OneArmCell, choices: Choices | Non
     proof = _verification(config, placement, result, verification) if verification else None
     accuracy = _accuracy(config, found, calibration + verification)
     verdict, reasons = _judge(found, proof, accuracy, _off(left_out, found.used))
-    reasons = (*reasons, *_moved(found, calibration), *found.warnings)
+    if moved := _moved(found, calibration):
+        # What holds for the rest of the views need not hold for what comes after.
+        verdict, reasons = "fail", (moved, *reasons)
+    reasons = (*reasons, *found.warnings)
     return _result(config, found, calibration, left_out, accuracy, proof, verdict=verdict, reasons=reasons)
 
 
-def _moved(found: OneArm, calibration: Sequence[CaptureRecord]) -> Iterator[str]:
-    """Where it is the last views, or the first, that do not belong to the others."""
+def _moved(found: OneArm, calibration: Sequence[CaptureRecord]) -> str:
+    """What is said where it is the last views, or the first, that do not belong to the others; else nothing."""
     dropped = np.flatnonzero(~found.used)
     count, views = len(dropped), len(calibration)
-    if count < _FEWEST_MOVED:
-        return
-    if dropped[0] == views - count:
-        yield f"the views from {calibration[dropped[0]].id} on are elsewhere: target or camera may have moved then"
-    elif dropped[-1] == count - 1:
-        yield f"the views up to {calibration[dropped[-1]].id} are elsewhere: target or camera may have moved then"
+    if count >= _FEWEST_MOVED and dropped[0] == views - count:
+        return f"the views from {calibration[dropped[0]].id} on are elsewhere: target or camera may have moved then"
+    if count >= _FEWEST_MOVED and dropped[-1] == count - 1:
+        return f"the views up to {calibration[dropped[-1]].id} are elsewhere: target or camera may have moved then"
+    return ""
 
 
 def _of(captures: Captures, use: str) -> list[CaptureRecord]:

@@ -951,4 +951,6 @@ def test_malformed_or_degenerate_captures_are_refused_and_nothing_is_written(tmp
 
 def test_the_schema_is_printed_as_json():
     schema = json.loads(dualcal("schema").stdout)
-    assert "procedure" in schema["properties"]
+    for document in ("CellDocument", "OneArmDocument"):
+        assert "procedure" in schema["$defs"][document]["properties"]
+    assert schema["then"] != schema["else"]

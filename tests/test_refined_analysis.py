@@ -310,6 +310,27 @@ class TestKnowns:
             analyse(few, cell(), "refined")
 
 
+class TestWhatIsOdd:
+    def test_captures_without_corners_are_for_the_other_method(self) -> None:
+        captures = changed(noisy(1), "", lambda c: replace(c, corners=None))
+        with pytest.raises(DegenerateCaptures, match="four corners"):
+            analyse(captures, cell(), "refined")
+        assert analyse(captures, cell(), "paper").verdict == "ok"
+
+    def test_a_board_that_should_be_behind_the_camera_fails(self, tmp_path: Path) -> None:
+        def turned(capture: CaptureRecord) -> CaptureRecord:
+            joints = np.array(capture.active_joints)
+            joints[4] += 2.6
+            return replace(capture, active_joints=tuple(joints.tolist()))
+
+        found = analyse(changed(noisy(1), "verification/00", turned), cell(), "refined")
+        assert found.verdict == "fail"
+        write_result(tmp_path / "result.json", found)
+        again = read_result(tmp_path / "result.json").verification
+        assert again is not None
+        assert again.probability == 0.0
+
+
 class TestBoardPoses:
     """Captures of another program that says where it saw the target."""
 

@@ -11,6 +11,7 @@ from dualcal_hal.config import CellConfig
 from dualcal_hal.errors import DegenerateCaptures, UsageError
 from dualcal_hal.session.accuracy import Accuracy, Verification, VerifiedCaptureRecord
 from dualcal_hal.session.captures import CaptureRecord, Captures
+from dualcal_hal.session.plain import LARGEST
 from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Rejected, Result, Unobservable, Verdict
 from dualcal_hal.transforms import Array, smallest_rotation, transform
 from procedures.analysis.accuracy import accuracy_record, region_of
@@ -175,18 +176,23 @@ def _verification_record(
     looked_at: Consistency, suspects: Sequence[Suspect], verification: Sequence[CaptureRecord]
 ) -> Verification:
     return Verification(
-        chi_square=looked_at.statistic,
+        chi_square=_finite(looked_at.statistic),
         degrees_of_freedom=looked_at.freedom,
-        probability=looked_at.probability,
+        probability=looked_at.probability if np.isfinite(looked_at.probability) else 0.0,
         least_probability=LEAST_PROBABILITY,
         captures=tuple(
-            VerifiedCaptureRecord(id=capture.id, chi_square=square, degrees_of_freedom=freedom)
+            VerifiedCaptureRecord(id=capture.id, chi_square=_finite(square), degrees_of_freedom=freedom)
             for capture, square, freedom in zip(
                 verification, looked_at.captures.tolist(), looked_at.freedoms.tolist(), strict=True
             )
         ),
         look_at=tuple(suspect.words for suspect in suspects),
     )
+
+
+def _finite(value: float) -> float:
+    """Of a board that should be behind the camera no square can be told: the largest a file holds."""
+    return value if np.isfinite(value) else LARGEST
 
 
 def _unobservable(found: Refined) -> tuple[Unobservable, ...]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dualcal_hal.transforms import Array, Mask, apply, inverse, rotation_angle
+from procedures.estimation.degenerate import Degenerate
 from procedures.estimation.projection import undistort
 from procedures.estimation.refined.closed_form import solve
 from procedures.estimation.refined.data import Indices
@@ -89,7 +90,8 @@ def camera_candidates(
     model: Model, order_known: Mask, board_poses: Sequence[ArrayLike | None] | None, thorough: bool
 ) -> Poses:
     """Poses of the camera at each arrival. Thorough: from each capture's board alone too, for arrivals whose captures
-    do not fit together; else only for those with unknown order or a single capture.
+    do not fit together; else only for those with unknown order or a single capture. Raises Degenerate where nothing
+    shows a pose.
     """
     T_P_T = model.T_P_F @ model.knowns.T_F_T
     rays, seen = seen_rays(model)
@@ -109,6 +111,11 @@ def camera_candidates(
             given = np.asarray(pose, dtype=float).reshape(-1, 4, 4)
             arrival = np.concatenate([arrival, np.repeat(model.arrival[k], len(given))])
             T_P_E = np.concatenate([T_P_E, camera_poses(T_P_T[k], given)])
+    if not len(arrival):
+        raise Degenerate(
+            "none of them shows four corners of its board, or says where it saw it; by their feature points alone only"
+            " method paper estimates"
+        )
     return _distinct(model, _agreed(model, T_P_T, order_known, arrival, T_P_E))
 
 

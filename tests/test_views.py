@@ -336,6 +336,14 @@ class TestFile:
         begun = [number for number, line in enumerate(lines, start=1) if line == "  {"]
         assert sorted(wheres) == [begun[1], begun[4]]
 
+    def test_views_that_are_all_wrong_are_not_told_to_be_none(self, changed: Callable[[Change], Path]) -> None:
+        path = changed(lambda d: [view.pop("flange_in_base") for view in d["views"]])
+        with pytest.raises(FormatError) as caught:
+            read_views(path)
+        assert all("flange_in_base: is missing" in problem.what for problem in caught.value.problems)
+        with pytest.raises(FormatError, match="at least 1"):
+            read_views(changed(lambda d: d["views"].clear()))
+
     def test_an_image_of_another_size_is_refused(self, changed: Callable[[Change], Path], tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / "small.png"), np.zeros((48, 64), np.uint8))
         result = dualcal("estimate", changed(lambda d: d["views"][1].update(image="small.png")))

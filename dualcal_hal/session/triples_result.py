@@ -23,9 +23,9 @@ T_F_T_NAME = "target_in_passive_flange"
 LETTERS = {"X": T_H_E_NAME, "Y": T_A_P_NAME, "Z": T_F_T_NAME}
 """Of AXB = YCZ, with the camera on the active arm and the target on the passive one."""
 
-_ORDER = ["translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z"]
-_FRAME = "child: log(T_found^-1 T_true), along and about the axes of the frame that the name begins with"
-_UNITS = "m and rad"
+ORDER = ["translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z"]
+FRAME = "child: log(T_found^-1 T_true), along and about the axes of the frame that the name begins with"
+UNITS = "m and rad"
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +106,11 @@ class TriplesResult:
         return {
             "format": FORMAT,
             "equation": {"form": "A X B = Y C Z", **LETTERS},
-            "transforms": {name: _transform(found) for name, found in self.transforms.items()},
+            "transforms": {name: found_document(found) for name, found in self.transforms.items()},
             "covariance": {
-                "of": [f"{name}: {component}" for name in LETTERS.values() for component in _ORDER],
-                "frame": _FRAME,
-                "units": _UNITS,
+                "of": [f"{name}: {component}" for name in LETTERS.values() for component in ORDER],
+                "frame": FRAME,
+                "units": UNITS,
                 "matrix": self.covariance.tolist(),
             },
             "noise": {
@@ -142,12 +142,13 @@ def write_triples_result(path: Path, result: TriplesResult) -> None:
     write_document(path, result.to_document())
 
 
-def _transform(found: Found) -> dict[str, Any]:
+def found_document(found: Found) -> dict[str, Any]:
+    """A transform with its covariance, as public files have it."""
     return {
         **transform_document(found.T),
         "sigma_mm": (1e3 * found.sigmas("position")).tolist(),
         "sigma_deg": np.degrees(found.sigmas("rotation")).tolist(),
-        "covariance": {"of": _ORDER, "frame": _FRAME, "units": _UNITS, "matrix": found.covariance.tolist()},
+        "covariance": {"of": ORDER, "frame": FRAME, "units": UNITS, "matrix": found.covariance.tolist()},
     }
 
 

@@ -21,7 +21,7 @@ or translation_m with quaternion_xyzw or rotation_vector_rad), ``id`` (left out:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -135,7 +135,8 @@ def read_views(path: Path) -> ViewsFile:
     try:
         document = _Document.model_validate(raw)
     except ValidationError as error:
-        raise _refused([_problem(path, lines, details) for details in error.errors(include_url=False)], path) from error
+        told = [details for details in error.errors(include_url=False) if not _follows(details, raw)]
+        raise _refused([_problem(path, lines, details) for details in told], path) from error
     board, wrong = _board(path, document.target)
     wrong += _of_camera(path, document.camera)
     views = tuple(View(view.id or view.image, path.parent / view.image, view.flange_in_base) for view in document.views)
@@ -161,6 +162,11 @@ def _refused(problems: Sequence[Problem], path: Path) -> FormatError:
     left = len(problems) - _MOST_PROBLEMS
     more = [Problem(str(path), f"{left} more problems of this kind")] if left > 0 else []
     return FormatError([*problems[:_MOST_PROBLEMS], *more])
+
+
+def _follows(details: Any, raw: Mapping[str, Any]) -> bool:
+    """Whether it is only said because all views that there are have problems of their own."""
+    return details["type"] == "too_short" and details["loc"] == ("views",) and bool(raw["views"])
 
 
 def _problem(path: Path, lines: Sequence[int], details: Any) -> Problem:

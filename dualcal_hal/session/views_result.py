@@ -14,17 +14,12 @@ import numpy as np
 
 from dualcal_hal.camera import Intrinsics
 from dualcal_hal.session.files import write_document
-from dualcal_hal.session.result import transform_document
-from dualcal_hal.session.triples_result import Found
+from dualcal_hal.session.triples_result import FRAME, ORDER, UNITS, Found, found_document
 from dualcal_hal.transforms import Array
 
 FORMAT = "dualcal.views-result/1"
 
 COEFFICIENTS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-
-_ORDER = ["translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z"]
-_FRAME = "child: log(T_found^-1 T_true), along and about the axes of the frame that the name begins with"
-_UNITS = "m and rad"
 
 
 @dataclass(frozen=True)
@@ -173,11 +168,11 @@ class ViewsResult:
             "placement": asdict(self.placement),
             "target_frame": f"origin in the inner corner of row {row} and column {column} from the top left, both from"
             " 0; x right and y up as its front is looked at, z towards the viewer",
-            "transforms": {name: _transform(found) for name, found in self.transforms.items()},
+            "transforms": {name: found_document(found) for name, found in self.transforms.items()},
             "covariance": {
-                "of": [f"{name}: {component}" for name in self.transforms for component in _ORDER],
-                "frame": _FRAME,
-                "units": _UNITS,
+                "of": [f"{name}: {component}" for name in self.transforms for component in ORDER],
+                "frame": FRAME,
+                "units": UNITS,
                 "matrix": self.covariance.tolist(),
             },
             "predicted_error": {
@@ -217,15 +212,6 @@ class ViewsResult:
 def write_views_result(path: Path, result: ViewsResult) -> None:
     """Write the public file atomically."""
     write_document(path, result.to_document())
-
-
-def _transform(found: Found) -> dict[str, Any]:
-    return {
-        **transform_document(found.T),
-        "sigma_mm": (1e3 * found.sigmas("position")).tolist(),
-        "sigma_deg": np.degrees(found.sigmas("rotation")).tolist(),
-        "covariance": {"of": _ORDER, "frame": _FRAME, "units": _UNITS, "matrix": found.covariance.tolist()},
-    }
 
 
 def _predicted(error: Predicted) -> dict[str, float]:

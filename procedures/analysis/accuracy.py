@@ -26,7 +26,7 @@ from dualcal_hal.session.accuracy import (
 from dualcal_hal.session.captures import CaptureRecord
 from dualcal_hal.transforms import Array
 from procedures.analysis.knowns import arrays, feature_points
-from procedures.estimation.refined import Limits, Noise, Refined
+from procedures.estimation.refined import Known, Limits, Noise, Refined
 from procedures.estimation.refined.guidance import would_help
 from procedures.estimation.refined.hidden import hidden
 from procedures.estimation.refined.uncertainty import spatial_error
@@ -85,7 +85,7 @@ def accuracy_record(
             )
             for other in found.alternatives
         ),
-        knowns=tuple(_knowns(found)),
+        knowns=known_records(found.known),
         cannot_be_seen=tuple(
             HiddenRecord(what=one.what, by=one.by, error_mm=1e3 * one.error)
             for one in hidden(found, _grid(region, _WITHIN))
@@ -172,9 +172,10 @@ def _captures(found: Refined, calibration: Sequence[CaptureRecord]) -> Iterator[
             )
 
 
-def _knowns(found: Refined) -> Iterator[KnownRecord]:
-    for known in found.known:
-        yield KnownRecord(
+def known_records(knowns: Sequence[Known]) -> tuple[KnownRecord, ...]:
+    """Of knowns that are not exact, after an estimate."""
+    return tuple(
+        KnownRecord(
             name=known.name,
             unit=known.unit,
             value=known.value,
@@ -182,6 +183,8 @@ def _knowns(found: Refined) -> Iterator[KnownRecord]:
             sigma=known.sigma,
             seen=known.seen,
         )
+        for known in knowns
+    )
 
 
 def _error_3d(found: Refined, cell: CellConfig, shared: Array, region: Array) -> Error3dRecord:

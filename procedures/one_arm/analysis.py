@@ -8,7 +8,7 @@ import numpy as np
 
 from dualcal_hal.config import OneArmCell, OneArmConfig
 from dualcal_hal.errors import DegenerateCaptures
-from dualcal_hal.session.accuracy import DirectionRecord, FoundSigmaRecord, KnownRecord, LimitsRecord
+from dualcal_hal.session.accuracy import DirectionRecord, FoundSigmaRecord, LimitsRecord
 from dualcal_hal.session.captures import CaptureRecord, Captures
 from dualcal_hal.session.one_arm_result import (
     CovarianceRecord,
@@ -26,6 +26,7 @@ from dualcal_hal.session.one_arm_result import (
 from dualcal_hal.session.result import Rejected, Verdict
 from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.analysis import Choices
+from procedures.analysis.accuracy import known_records
 from procedures.detection.outcome import corners_from_record
 from procedures.estimation import Degenerate
 from procedures.estimation.refined import Limits, Refined
@@ -202,7 +203,7 @@ def _result(
         left_out=_off(left_out, found.used),
         views=tuple(_view_records(found, calibration, left_out)),
         verification=proof,
-        knowns=tuple(_knowns(found)),
+        knowns=known_records(found.known),
         captures_used=tuple(c.id for c, used in zip(calibration, found.used, strict=True) if used),
         captures_rejected=tuple(Rejected(calibration[one.capture].id, one.reason) for one in found.dropped),
         verdict=verdict,
@@ -244,18 +245,6 @@ def _view_records(found: OneArm, captures: Sequence[CaptureRecord], left_out: Le
             chi_square=float(found.distances[k]) if known else None,
             degrees_of_freedom=float(found.freedoms[k]) if known else None,
             residuals_px=_corners(found.residuals[k]),
-        )
-
-
-def _knowns(found: OneArm) -> Iterator[KnownRecord]:
-    for known in found.known:
-        yield KnownRecord(
-            name=known.name,
-            unit=known.unit,
-            value=known.value,
-            prior_sigma=known.prior if np.isfinite(known.prior) else None,
-            sigma=known.sigma,
-            seen=known.seen,
         )
 
 

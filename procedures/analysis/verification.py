@@ -55,8 +55,10 @@ def poses(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[Array, A
 
 def joints(captures: Sequence[CaptureRecord], cell: CellConfig) -> tuple[Array, Array]:
     """Of the active and the passive arm, (k, n) rad."""
-    active = np.array([capture.active_joints for capture in captures]).reshape(-1, cell.active.chain.joints)
-    passive = np.array([capture.passive_joints for capture in captures]).reshape(-1, cell.passive.chain.joints)
+    active = np.array([capture.active_joints for capture in captures]).reshape(len(captures), cell.active.chain.joints)
+    passive = np.array([capture.passive_joints for capture in captures]).reshape(
+        len(captures), cell.passive.chain.joints
+    )
     return active, passive
 
 

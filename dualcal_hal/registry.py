@@ -37,6 +37,14 @@ def backend_class(name: str) -> type[Backend]:
     return found
 
 
+def is_simulated(name: str) -> bool:
+    """Whether no real device stands behind a backend; one that is not installed here is taken for one of real ones."""
+    try:
+        return backend_class(name).simulated
+    except (UsageError, ImportError):
+        return False
+
+
 def require_extra(place: str, extra: str, modules: tuple[str, ...]) -> None:
     """CellFileError if what a ``place`` of the cell file needs is not installed: refused before anything is begun."""
     for module in modules:

@@ -64,17 +64,13 @@ class VerificationConfig(Section):
     """Method refined: what the predicted 3D error (95 %) may be all over the region, mm; 1 where left out, which only
     a cell that is simulated may."""
     region: RegionConfig | None = None
-    """Method refined: where the accuracy is required; the box of the verification points where left out."""
+    """Method refined: where the accuracy is required; where left out the box of the verification points, and without
+    these that of the points calibrated with."""
 
     @property
     def limit(self) -> float:
         """Metres."""
         return self.limit_mm / 1000
-
-    @property
-    def required_accuracy(self) -> float:
-        """Metres."""
-        return (self.required_accuracy_mm or DEFAULT_ACCURACY_MM) / 1000
 
 
 DEFAULT_ACCURACY_MM = 1.0

@@ -7,6 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from dualcal_hal.config import CellConfig
+from dualcal_hal.config.procedure import DEFAULT_ACCURACY_MM
+from dualcal_hal.errors import UsageError
+from dualcal_hal.registry import is_simulated
 from dualcal_hal.session.accuracy import (
     Accuracy,
     AlternativeRecord,
@@ -39,6 +42,20 @@ _REST = 0.05
 
 _WITHIN = (3, 3, 3)
 """Points of the region that are looked at: the error is largest in a corner, as its square is convex."""
+
+
+def required_accuracy_mm(cell: CellConfig) -> float:
+    """As the cell file says, mm; of a simulated cell a default. UsageError where nobody has said it of real arms."""
+    stated = cell.procedure.verification.required_accuracy_mm
+    if stated is not None:
+        return stated
+    used = {*(arm.backend for arm in cell.arms.values()), cell.camera.backend}
+    if not all(is_simulated(cell.backends[name].type) for name in used):
+        raise UsageError(
+            "procedure.verification.required_accuracy_mm: missing, and only a cell that is simulated goes without;"
+            " write it into a copy of the cell file and name that with --cell"
+        )
+    return DEFAULT_ACCURACY_MM
 
 
 def region_of(cell: CellConfig, captures: Sequence[CaptureRecord]) -> Array:
@@ -196,7 +213,7 @@ def _error_3d(found: Refined, cell: CellConfig, shared: Array, region: Array) ->
         region=RegionRecord(low_mm=low, high_mm=high),
         rms_mm=1e3 * float(within.rms.max()),
         p95_mm=1e3 * float(within.p95.max()),
-        required_mm=1e3 * cell.procedure.verification.required_accuracy,
+        required_mm=required_accuracy_mm(cell),
         map=MapRecord(
             points_mm=tuple(map(tuple, (1e3 * points).tolist())),
             rms_mm=tuple((1e3 * over.rms).tolist()),

@@ -8,7 +8,6 @@ from pathlib import Path
 from dualcal_hal import registry
 from dualcal_hal.cellfile import CellFile, load_cell
 from dualcal_hal.config import StandTruthConfig
-from dualcal_hal.errors import UsageError
 from dualcal_hal.session.conduct import read_conduct
 from dualcal_hal.session.folder import CELL_FILE, Session
 from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME
@@ -39,15 +38,10 @@ def told_truth(file: CellFile) -> Mapping[str, Array] | None:
 def _is_simulated(file: CellFile) -> bool:
     cell = file.cell
     used = [cell.backends[name] for name in {*(arm.backend for arm in cell.arms.values()), cell.camera.backend}]
-    try:
-        return all(
-            _was_simulated(Path(entry.options["session"]))
-            if entry.type == "replay"
-            else registry.backend_class(entry.type).simulated
-            for entry in used
-        )
-    except (UsageError, ImportError):  # one that is not installed here; none that simulates is missing
-        return False
+    return all(
+        _was_simulated(Path(entry.options["session"])) if entry.type == "replay" else registry.is_simulated(entry.type)
+        for entry in used
+    )
 
 
 def _was_simulated(recording: Path) -> bool:

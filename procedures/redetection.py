@@ -52,7 +52,7 @@ def detect_anew(session: Session, captures: Captures, cell: CellConfig) -> Detec
             moved.append((found.corners - before).ravel())
         feature = (float(found.feature[0]), float(found.feature[1]))
         corners = corners_to_record(found.corners)
-        kept.append(replace(capture, feature=feature, corners=corners, order_known=found.order_known))
+        kept.append(replace(capture, feature=feature, corners=corners, order_known=found.order_known, board_pose=None))
     rms = float(np.sqrt(np.nanmean(np.square(np.concatenate(moved))))) if moved else None
     return DetectedAnew(replace(captures, captures=tuple(kept)), tuple(missed), rms)
 

@@ -380,9 +380,7 @@ class TestBoardPoses:
         captures = with_corners(self.poses(1, covariance=True), cell())
         write_captures(tmp_path / "captures.json", captures)
         document = json.loads((tmp_path / "captures.json").read_text())
-        for entry in document["captures"]:
-            del entry["feature_px"], entry["corners_px"]
-        (tmp_path / "captures.json").write_text(json.dumps(document))
+        assert not any({"feature_px", "corners_px"} & entry.keys() for entry in document["captures"])
         again = with_corners(read_captures(tmp_path / "captures.json"), cell())
         assert again == captures
 

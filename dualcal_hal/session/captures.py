@@ -1,6 +1,10 @@
 """``captures.json``: what a run measured, one entry for each frame that counts.
 
 The public format ``dualcal.captures/1``. Other programs write it too: keys that are not known are ignored.
+
+An entry tells of the target by ``feature_px`` and ``corners_px``, or by ``target_in_camera`` in place of both. Where it
+has both, the corners are what was measured: ``target_in_camera``, which was made from them, is left out with its
+covariance.
 """
 
 from __future__ import annotations
@@ -55,7 +59,8 @@ class CaptureRecord:
     the exposure; feature, corners: px in the distorted image, corners by index on the board, None for one that was not
     seen, or None altogether; image_size: width and height, px; aligned: whether the feature was within the tolerance;
     order_known: False where two orientations of the pattern fitted; board_pose: of the target, in place of corners that
-    another program does not tell; the feature is NaN then until the camera is known.
+    another program does not tell; feature and corners are then where the camera would see them, NaN and None until it
+    is known.
     """
 
     id: str
@@ -74,6 +79,11 @@ class CaptureRecord:
 
     def to_record(self) -> dict[str, Any]:
         """The entry as in the file."""
+        if self.board_pose is None:
+            corners = None if self.corners is None else [corner and list(corner) for corner in self.corners]
+            sight: dict[str, Any] = {"feature_px": list(self.feature), "corners_px": corners}
+        else:
+            sight = {"target_in_camera": self.board_pose.to_record()}
         return {
             "id": self.id,
             "use": self.use,
@@ -82,12 +92,10 @@ class CaptureRecord:
             "active_arrival": self.active_arrival,
             "active_joints_rad": list(self.active_joints),
             "passive_joints_rad": list(self.passive_joints),
-            "feature_px": list(self.feature),
-            "corners_px": None if self.corners is None else [corner and list(corner) for corner in self.corners],
+            **sight,
             "image_px": list(self.image_size),
             "aligned": self.aligned,
             "order": "known" if self.order_known else "unknown",
-            **({} if self.board_pose is None else {"target_in_camera": self.board_pose.to_record()}),
         }
 
     @classmethod
@@ -234,6 +242,7 @@ class _Entry(BaseModel):
     order: Literal["known", "unknown"] = "known"
 
     def capture(self, arrival: int) -> CaptureRecord:
+        pose = self.target_in_camera if self.corners_px is None else None
         return CaptureRecord(
             id=self.id,
             use=self.use,
@@ -247,7 +256,7 @@ class _Entry(BaseModel):
             image_size=self.image_px,
             aligned=self.aligned,
             order_known=self.order == "known",
-            board_pose=None if self.target_in_camera is None else BoardPose(**self.target_in_camera.model_dump()),
+            board_pose=None if pose is None else BoardPose(**pose.model_dump()),
         )
 
 
@@ -263,8 +272,8 @@ def _entry(record: Any, name: str) -> tuple[_Entry | None, list[Problem]]:
 
 
 def _missing_sight(record: Mapping[str, Any], name: str) -> Iterator[Problem]:
-    """Pixels may be left out where another program says where it saw the target."""
-    if record.get("target_in_camera") is not None:
+    """Pixels may be left out where another program says where it saw the target, and nothing else."""
+    if record.get("target_in_camera") is not None and record.get("corners_px") is None:
         return
     for key in ("feature_px", "corners_px"):
         if key not in record:

@@ -2,20 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from dualcal_hal.config import CellConfig
+from dualcal_hal.errors import FormatError, Problem, UsageError
 from dualcal_hal.session.captures import CaptureRecord, Captures
 from dualcal_hal.transforms import Array, apply, skew
 from procedures.estimation.projection import project, project_with_jacobian
 
+FARTHEST = 100.0
+"""m from the camera; a target that is farther is in other units."""
+
 
 def with_corners(captures: Captures, cell: CellConfig) -> Captures:
-    """The same with the corners and the feature point where the camera would see them on a target in that pose."""
+    """The same with the corners and the feature point where the camera would see them on a target in that pose.
+
+    Raises FormatError for all poses of a target that no camera sees there.
+    """
+    if problems := list(_impossible(captures.captures, cell)):
+        raise FormatError(problems)
     return replace(captures, captures=tuple(_with_corners(capture, cell) for capture in captures.captures))
+
+
+def _impossible(captures: Sequence[CaptureRecord], cell: CellConfig) -> Iterator[Problem]:
+    for capture in captures:
+        if capture.board_pose is None:
+            continue
+        pose = np.array(capture.board_pose.matrix)
+        if np.linalg.norm(pose[:3, 3]) > FARTHEST:
+            yield Problem(capture.id, f"target_in_camera: is more than {FARTHEST:g} m away; the unit must be m")
+        elif np.any(apply(pose, cell.target.board.corners)[:, 2] <= 0):
+            yield Problem(capture.id, "target_in_camera: has the target behind the camera, whose z must point forward")
+        elif pose[:3, 2] @ pose[:3, 3] >= 0:
+            yield Problem(capture.id, "target_in_camera: is seen from behind; the target's z must point to the viewer")
 
 
 def _with_corners(capture: CaptureRecord, cell: CellConfig) -> CaptureRecord:
@@ -23,10 +45,30 @@ def _with_corners(capture: CaptureRecord, cell: CellConfig) -> CaptureRecord:
         return capture
     camera, board = cell.camera.intrinsics, cell.target.board
     seen = project(apply(np.array(capture.board_pose.matrix), board.corners), camera.matrix, camera.distortion)
-    if not np.all(np.isfinite(seen)):
-        return capture
     corners = tuple((float(u), float(v)) for u, v in seen)
     return replace(capture, corners=corners, feature=corners[board.feature])
+
+
+def refuse_what_poses_hide(captures: Captures, cell: CellConfig, free: Sequence[str]) -> None:
+    """UsageError where lens or squares are to be found, or reckoned with, and a capture has a pose in place of corners.
+
+    What a lens or a square that is off does to such a pose was decided by the program that made it, so one of them is
+    enough: it would be taken for one that the true lens and squares have seen.
+    """
+    posed = [capture.id for capture in captures.captures if capture.board_pose is not None]
+    sigma = cell.camera.intrinsics_sigma
+    asked = {
+        "--free intrinsics": "intrinsics" in free,
+        "camera.intrinsics_sigma": sigma is not None
+        and bool(sigma.focal_px or sigma.centre_px or any(sigma.distortion)),
+        "target.square_sigma_mm": bool(cell.target.square_sigma_mm),
+    }
+    unfit = [name for name, given in asked.items() if given]
+    if posed and unfit:
+        raise UsageError(
+            f"{' and '.join(unfit)}: {len(posed)} captures, the first {posed[0]}, have target_in_camera in place of"
+            " corners, and a pose does not show lens or squares; go without, or use captures with corners alone"
+        )
 
 
 def weights_of(captures: Sequence[CaptureRecord], cell: CellConfig) -> Array | None:

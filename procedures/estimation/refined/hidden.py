@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from dualcal_hal.kinematics import Chain, Row
 from dualcal_hal.transforms import Array, apply, inverse
+from procedures.estimation.refined.arms import Arm
 from procedures.estimation.refined.estimate import Refined
 from procedures.estimation.refined.inexact import COMMON_SCALE
+from procedures.estimation.refined.mount import is_free_mount
 
 # What is told of where no sigma is stated.
 _ANGLE = float(np.radians(0.1))
 _LENGTH = 1e-3  # m
 _SCALE = 1e-3
+
+_STEP = 1e-6  # m or rad: of the differences
 
 
 @dataclass(frozen=True)
@@ -32,35 +38,78 @@ def hidden(result: Refined, points: Array) -> tuple[Hidden, ...]:
     """At points (k, 3) of P, m; off by their sigma, where one is stated, else by what is easily wrong.
 
     The zero of joint 1 and the height d1 of an arm turn and lift all of it about its own base's z-axis: T_P_A takes
-    that up, and the arms still meet where they met, but T_P_A is that between the turned bases. Row 6 of the active arm
-    is taken up by T_H_E, which is then off at the camera. A scale common to both arms stretches the whole cell.
+    that up, and the arms still meet where they met, but T_P_A is that between the turned bases. All four numbers of the
+    active arm's last row move its flange as it sees itself: T_H_E takes them up, and is then off at the camera. So does
+    a mount T_F_T that is free with those of the passive arm's last row, and is off at the target. A scale common to
+    both arms stretches the whole cell.
     """
     sigmas = {known.name: known.prior for known in result.known if np.isfinite(known.prior)}
-    in_active = apply(inverse(result.T_P_A), points)
-    apart = float(np.linalg.norm(points - result.T_P_A[:3, 3], axis=-1).max())
-    aside = float(np.hypot(*result.T_H_E[:2, 3]))
-    told = [*_of_base("passive", points), *_of_base("active", in_active)]
-    told += [
-        ("zero of joint 6 of the active arm", "against its flange", _ANGLE, aside),
-        ("d of row 6 of the active arm", "against its flange", _LENGTH, 1.0),
-        ("a of row 6 of the active arm", "against its flange", _LENGTH, 1.0),
-        (COMMON_SCALE, "", _SCALE, apart),
+    knowns = result.knowns
+    told = [
+        *_of_base("passive", knowns.passive, points),
+        *_of_base("active", knowns.active, apply(inverse(result.T_P_A), points)),
+        *_of_flange("active", knowns.active, result.T_H_E[:3, 3]),
     ]
-    return tuple(_hidden(name, where, sigmas.get(name, easily), lever) for name, where, easily, lever in told)
+    if any(is_free_mount(one) for one in result.inexact):
+        told += _of_flange("passive", knowns.passive, knowns.T_F_T[:3, 3])
+    apart = float(np.linalg.norm(points - result.T_P_A[:3, 3], axis=-1).max())
+    by = sigmas.get(COMMON_SCALE, _SCALE)
+    scale = Hidden(f"the {COMMON_SCALE}", f"{1e6 * by:g} ppm", by * apart)
+    return (*(one.off_by(sigmas) for one in told), scale)
 
 
-def _of_base(arm: str, points: Array) -> Iterator[tuple[str, str, float, float]]:
-    """Names, against what, by what they are easily off, and the error of the worst point by one rad or m."""
-    across = float(np.hypot(points[:, 0], points[:, 1]).max())
-    yield f"zero of joint 1 of the {arm} arm", "against its base", _ANGLE, across
-    yield f"d of row 1 of the {arm} arm", "against its base", _LENGTH, 1.0
+@dataclass(frozen=True)
+class _Number:
+    """name: as of an inexact known; of: what it is in its row; against: what; lever: error of the worst point by one m
+    or rad.
+    """
+
+    name: str
+    of: str
+    against: str
+    lever: float
+
+    def off_by(self, sigmas: dict[str, float]) -> Hidden:
+        if self.of in ("d", "a"):
+            off = sigmas.get(self.name, _LENGTH)
+            by = f"{1e3 * off:.2g} mm"
+        else:
+            off = sigmas.get(self.name, _ANGLE)
+            by = f"{np.degrees(off):.2g} deg"
+        return Hidden(f"the {self.name}, against its {self.against}", by, off * self.lever)
 
 
-def _hidden(name: str, where: str, off: float, lever: float) -> Hidden:
-    if name == COMMON_SCALE:
-        by = f"{1e6 * off:g} ppm"
-    elif name.startswith("zero"):
-        by = f"{np.degrees(off):.2g} deg"
-    else:
-        by = f"{1e3 * off:.2g} mm"
-    return Hidden(f"the {name}, {where}" if where else f"the {name}", by, off * lever)
+def _of_base(name: str, arm: Arm, points: Array) -> Iterator[_Number]:
+    """points (k, 3) in the arm's base, m."""
+    if isinstance(arm, Chain):
+        row = arm.rows[0]
+        for of in ("theta",) if row.beta is not None else ("theta", "d"):
+            before, after = _there(row), _there(_changed(row, of))
+            yield _Number(_named(of, 1, name), of, "base", _largest(after @ inverse(before), points))
+
+
+def _of_flange(name: str, arm: Arm, point: Array) -> Iterator[_Number]:
+    """point (3,) in the arm's flange, m."""
+    if isinstance(arm, Chain):
+        row = arm.rows[-1]
+        for of in ("theta", "d", "a", "alpha") if row.beta is None else ("theta", "a", "alpha", "beta"):
+            before, after = _there(row), _there(_changed(row, of))
+            yield _Number(_named(of, arm.joints, name), of, "flange", _largest(inverse(before) @ after, [point]))
+
+
+def _named(of: str, number: int, arm: str) -> str:
+    return f"zero of joint {number} of the {arm} arm" if of == "theta" else f"{of} of row {number} of the {arm} arm"
+
+
+def _there(row: Row) -> Array:
+    return Chain((row,)).forward([0.0])
+
+
+def _changed(row: Row, of: str) -> Row:
+    return replace(row, **{of: getattr(row, of) + _STEP})
+
+
+def _largest(moved: Array, points: ArrayLike) -> float:
+    """By which one of the points (k, 3) is moved, by the step."""
+    there = np.asarray(points, dtype=float)
+    return float(np.linalg.norm(apply(moved, there) - there, axis=-1).max()) / _STEP

@@ -74,10 +74,12 @@ class SmallServer:
         self.positions = {group: [0.1 * joint for joint in range(JOINTS)] for group in self.groups}
         self.news = threading.Condition()
         self.quiet = threading.Event()  # the state port is silent
+        self.states = 0  # so many were sent
         self.memory: dict[str, Any] = {}
-        self._closing = threading.Event()
-        self._open: list[socket.socket] = []
-        self._lock = threading.Lock()
+        self.closing = threading.Event()
+        self._listening: list[socket.socket] = []
+        self._accepted: dict[str, list[socket.socket]] = {"motion_port": [], "state_port": []}
+        self._changed = threading.Condition()  # of what is accepted
         self._threads: list[threading.Thread] = []
         self.motion_port = self.state_port = 0
         self.start()
@@ -86,40 +88,49 @@ class SmallServer:
 
     def start(self) -> None:
         """Listen: on the ports that it had before, if it had any."""
-        self._closing.clear()
+        self.closing.clear()
         for name, serve in (("motion_port", self._motion), ("state_port", self._state)):
             listener = socket.socket()
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(("127.0.0.1", getattr(self, name)))
             listener.listen()
             setattr(self, name, listener.getsockname()[1])
-            self._open.append(listener)
-            self._begin(self._accept, listener, serve)
+            self._listening.append(listener)
+            self._begin(self._accept, listener, name, serve)
 
     def close(self) -> None:
         """As a controller that is switched off."""
-        self._closing.set()
+        self.closing.set()
         self.cut()
         while self._threads:
             self._threads.pop().join()
 
     def cut(self, port: str | None = None) -> None:
-        """Break connections: all and the listening, or those of one port alone."""
-        with self._lock:
-            for opened in list(self._open):
-                if port is not None and opened.getsockname()[1] != getattr(self, port):
-                    continue
-                if port is not None and opened.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
-                    continue
-                with suppress(OSError):
-                    opened.shutdown(socket.SHUT_RDWR)
-                opened.close()
-                self._open.remove(opened)
+        """Break connections: all and the listening, or those of one port alone, of which there is one at least."""
+        with self._changed:
+            if port is not None:
+                # To the client it is made before it is accepted here.
+                assert self._changed.wait_for(lambda: self._accepted[port], PATIENCE), f"nobody came to the {port}"
+            for name, connections in self._accepted.items():
+                if port in (None, name):
+                    _end(connections)
+            if port is None:
+                _end(self._listening)
 
     def wait_for(self, happened: Callable[[], bool]) -> None:
         """Until it has, whenever a message came; fails after a while."""
         with self.news:
             assert self.news.wait_for(happened, PATIENCE), [(r.id, r.body[:8].hex()) for r in self.received]
+
+    def tells_anew(self) -> None:
+        """Wait until a state was sent that was made after this call: one may be on its way that was made before."""
+        before = self.states
+        self.wait_for(lambda: self.states >= before + 2)
+
+    @property
+    def asked(self) -> list[Received]:
+        """What it was sent but PINGs, which come whenever nothing else has for a while."""
+        return [message for message in self.received if message.id != 1]
 
     def of(self, identity: int) -> list[Received]:
         return [message for message in self.received if message.id == identity]
@@ -154,36 +165,40 @@ class SmallServer:
         thread.start()
         self._threads.append(thread)
 
-    def _accept(self, listener: socket.socket, serve: Callable[[socket.socket], None]) -> None:
-        while not self._closing.is_set():
+    def _accept(self, listener: socket.socket, name: str, serve: Callable[[socket.socket], None]) -> None:
+        while not self.closing.is_set():
             try:
                 made, _ = listener.accept()
             except OSError:
                 return
-            with self._lock:
-                if self._closing.is_set():
+            with self._changed:
+                if self.closing.is_set():
                     made.close()
                     return
-                self._open.append(made)
-            self._begin(self._guarded, serve, made)
+                self._accepted[name].append(made)
+                self._changed.notify_all()
+            self._begin(self._guarded, name, serve, made)
 
-    def _guarded(self, serve: Callable[[socket.socket], None], made: socket.socket) -> None:
+    def _guarded(self, name: str, serve: Callable[[socket.socket], None], made: socket.socket) -> None:
         with suppress(OSError):
             serve(made)
-        with self._lock:
-            if made in self._open:
-                self._open.remove(made)
+        with self._changed:
+            if made in self._accepted[name]:
+                self._accepted[name].remove(made)
                 made.close()
 
     def _state(self, made: socket.socket) -> None:
         due = CLOCK.now()
-        while not self._closing.is_set():
+        while not self.closing.is_set():
             if not self.quiet.is_set():
                 data = self.joints_packets() + (self.status_packet() if self.tells_status else b"")
                 for chunk in self.state_chunks(data):
                     made.sendall(chunk)
+                with self.news:
+                    self.states += 1
+                    self.news.notify_all()
             due = max(due + self.period, CLOCK.now())
-            CLOCK.wait(self._closing, due)
+            CLOCK.wait(self.closing, due)
 
     def _motion(self, made: socket.socket) -> None:
         while (head := _exactly(made, 4)) is not None:
@@ -198,6 +213,14 @@ class SmallServer:
             reply = self.answer(self, message)
             if reply is not None:
                 made.sendall(reply)
+
+
+def _end(connections: list[socket.socket]) -> None:
+    while connections:
+        ended = connections.pop()
+        with suppress(OSError):
+            ended.shutdown(socket.SHUT_RDWR)
+        ended.close()
 
 
 def _exactly(made: socket.socket, count: int) -> bytes | None:

@@ -81,9 +81,9 @@ class Refined:
     its degrees of freedom. flipped (k,): captures taken with their corners from the other end. used (k,).
 
     noise, knowns: what was reckoned with; found: what the captures themselves say of the noise, if that was asked for;
-    inexact: knowns that were not taken as exact, and known: what they are after the estimate; joint_covariance
-    (12 + m, 12 + m): of the cell with their m numbers. contributions: to the covariance (12, 12), of pixels, of the
-    joints of both arms and of each inexact known.
+    inexact: knowns that were not taken as exact, counted from ``prior``, and known: what they are after the estimate;
+    joint_covariance (12 + m, 12 + m): of the cell with their m numbers. contributions: to the covariance (12, 12), of
+    pixels, of the joints of both arms and of each inexact known.
     """
 
     T_P_A: Array
@@ -106,6 +106,7 @@ class Refined:
     warnings: tuple[str, ...]
     noise: Noise
     knowns: Knowns
+    prior: Knowns
     contributions: dict[str, Array]
     joint_covariance: Array
     found: FoundNoise | None = None
@@ -149,26 +150,27 @@ def refined(
         there = _with_inexact(data, knowns, noise, _estimate(data, knowns, noise, *fixed), inexact, True).knowns
     result, found = _estimate(data, there, noise, *fixed), None
     for _ in range(_NOISE_ROUNDS if estimate_noise else 0):
-        found = find_noise(_kept(data, result), there, noise, result.T_P_A, result.T_H_E)
+        found = find_noise(kept(data, result), there, noise, result.T_P_A, result.T_H_E)
         result = _estimate(data, there, found.noise, *fixed)
     if found is not None:
         result = replace(result, found=found, warnings=(*result.warnings, *_noise_warnings(found)))
     if not inexact:
         return result
     found_knowns = _with_inexact(data, knowns, result.noise, result, inexact, estimate_inexact)
-    return _combined(result, counted_from(given, found_knowns), inexact, fixed[2])
+    return replace(_combined(result, counted_from(given, found_knowns), inexact, fixed[2]), prior=knowns)
 
 
-def _kept(data: CaptureArrays, result: Refined) -> CaptureArrays:
+def kept(data: CaptureArrays, result: Refined) -> CaptureArrays:
+    """Of the captures that were estimated from, those that were used, with their corners in order."""
     return replace(data, arrivals=_by_reading(data)).turned(result.flipped).only(result.used)
 
 
 def _with_inexact(
     data: CaptureArrays, knowns: Knowns, noise: Noise, result: Refined, inexact: Sequence[Inexact], estimated: bool
 ) -> WithInexact:
-    kept = _kept(data, result)
-    start = Model(kept, knowns, noise).state(result.T_P_A, result.T_H_E)
-    return fit_inexact(kept, knowns, noise, start, inexact, estimated)
+    used = kept(data, result)
+    start = Model(used, knowns, noise).state(result.T_P_A, result.T_H_E)
+    return fit_inexact(used, knowns, noise, start, inexact, estimated)
 
 
 def _combined(result: Refined, found: WithInexact, inexact: Sequence[Inexact], observable: Limits) -> Refined:
@@ -415,6 +417,7 @@ def _result(
         warnings=(*warnings, *_warnings(fit, found, scale, alternatives)),
         noise=search.every.noise,
         knowns=search.every.knowns,
+        prior=search.every.knowns,
         contributions=contributions,
         joint_covariance=covariance,
     )

@@ -203,7 +203,7 @@ def fit_inexact(
     model = Model(data, knowns, noise)
     fit = minimise(model, start)
     for _ in range(_MOST_ROUNDS):
-        cross, own, gradient = _information(data, knowns, noise, inexact, theta, model, fit)
+        cross, own, gradient = information(data, knowns, noise, inexact, theta, model, fit)
         left = own - cross.T @ np.linalg.solve(fit.at.normal, cross) + np.diag(precision)
         covariance = _inverted(left, np.sqrt(np.diag(own) + precision), inexact)
         if not estimated:
@@ -235,7 +235,7 @@ def fit_inexact(
     )
 
 
-def _information(
+def information(
     data: CaptureArrays,
     knowns: Knowns,
     noise: Noise,

@@ -18,8 +18,7 @@ from backends.controller.link import ArmLink, ArmReport, Transfer
 from backends.controller.options import TcpLink
 from backends.controller.robot import ControlledRobot
 from backends.controller.tcp import links, port
-from backends.controller.tcp.state import Freshness
-from backends.controller.tcp.transport import Address, Connection
+from backends.controller.tcp.transport import Connection
 from dualcal_hal.errors import (
     CommandRefused,
     DeviceError,
@@ -58,6 +57,12 @@ ANSWERS: dict[str, Answer] = {"rep": rep, "abb": abb, "fanuc": fanuc, "motoman":
 def _soon_observed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rate and jitter may be those of a moment, where a test is about something else."""
     monkeypatch.setattr("backends.controller.tcp.feedback._OBSERVED", 0.1)
+
+
+@pytest.fixture(autouse=True)
+def _late_is_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both ends share a machine here that may have much else to do; test_tcp_freshness.py has the real limit."""
+    monkeypatch.setattr("backends.controller.tcp.state.LATE_AT_LEAST", 0.5)
 
 
 def soon(seconds: float = PATIENCE) -> float:
@@ -942,22 +947,6 @@ def test_feedback_that_stops_is_late_first_and_then_the_link_is_lost() -> None:
         # The stop goes by the port that still stands.
         link.stop("lost")
         server.wait_for(lambda: -4 in server.sequences())
-
-
-@pytest.mark.parametrize(("period", "allowed"), [(0.004, 0.1), (0.1, 0.3), (0.5, 1.0)])
-def test_feedback_is_late_after_three_periods_and_a_tenth_of_a_second(period: float, allowed: float) -> None:
-    freshness = Freshness("left", Address("cell", 11002), 0.0)
-    arrivals = [period * number for number in range(1, 100)]
-    for time in arrivals:
-        assert freshness.look(time - 1e-6) is None
-        freshness.arrived(time)
-    assert freshness.due() == pytest.approx(arrivals[-1] + allowed)
-    assert freshness.look(arrivals[-1] + allowed - 1e-6) is None
-    if allowed < 1.0:
-        assert "ms old" in str(freshness.look(arrivals[-1] + allowed + 1e-6))
-        assert freshness.look(arrivals[-1] + 1.0 - 1e-6) is None, "it is told once"
-    with pytest.raises(LinkLost, match="no feedback"):
-        freshness.look(arrivals[-1] + 1.0 + 1e-6)
 
 
 @pytest.mark.parametrize("period", [0.1, 0.004])

@@ -1,106 +1,214 @@
-"""What captures would make seen what those that were taken do not determine."""
+"""What would show what the captures that were taken do not determine: other captures, or a known measured better."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualcal_hal.transforms import Array, inverse, rotation_from_vector, transform
+from dualcal_hal.kinematics import Chain
+from dualcal_hal.transforms import Array, apply, inverse, rotation_from_vector, transform
+from procedures.estimation.projection import project
+from procedures.estimation.refined.arms import Arm
 from procedures.estimation.refined.data import CaptureArrays
 from procedures.estimation.refined.estimate import Refined
-from procedures.estimation.refined.model import CELL, Linearised, Model, marginalised
-from procedures.estimation.refined.motion import adjoint
+from procedures.estimation.refined.fit import Fit
+from procedures.estimation.refined.inexact import information
+from procedures.estimation.refined.model import CELL, Model
 
 _TURN = float(np.radians(40.0))
 _SHIFT = 0.15  # m
 _DEPTH = 0.1  # m
 _SAME = "as many captures again, of the same kinds"
-_WORTH = 0.8  # of the sigma that more of the same leaves; what does not come below it is not worth a word of its own
+_AS_GOOD = 0.7  # of a sigma: what twice as many captures once more would make of it
+_HELPS = 0.9  # of the sigma now; what leaves more does not help
+_BETTER = 2.0  # times as exact is a known that is measured better
 
 
 def would_help(result: Refined, captures: CaptureArrays) -> tuple[str, ...]:
-    """A line for each kind of captures that helps most with a direction that is not observable; empty where all are.
+    """A line for each thing that helps with a direction that is not observable, few of them; empty where all are.
 
-    Each kind is reckoned with as if as many captures as there are were taken again in that way: what they would say of
-    the cell is added to what is known, and the kind that leaves the smallest sigma is named. captures: those of the
+    Kinds of captures are reckoned with as if as many as there are were taken again in that way, each inexact known as
+    if it were measured twice as exactly. Named is what leaves about the smallest sigma. captures: those of the
     estimate, all of them, in its order.
     """
     hidden = [index for index, direction in enumerate(result.directions) if not direction.observable]
     if not hidden:
         return ()
-    known = np.linalg.inv(result.covariance)
-    sigmas = {words: np.sqrt(np.diag(np.linalg.inv(known + gain))) for words, gain in _gains(result, captures)}
+    known = _Known.of(result)
+    left = {words: known.with_captures(*gain).sigmas() for words, gain in _gains(result, captures)}
+    left |= {f"measure the {what} better": known.measured(numbers).sigmas() for what, numbers in _measurable(result)}
+    now = known.sigmas()
+    good = {i: _good({words: float(sigmas[i] / now[i]) for words, sigmas in left.items()}) for i in hidden}
     said: dict[str, list[str]] = {}
-    for index in hidden:
-        best = min(sigmas, key=lambda words: float(sigmas[words][index]))
-        if sigmas[best][index] > _WORTH * sigmas[_SAME][index]:
-            best = _SAME
-        said.setdefault(best, []).append(result.directions[index].name)
+    while good:
+        best = max(left, key=lambda words: _helped(words, good.values()))
+        said[best] = [result.directions[i].name for i in good if best in good[i]]
+        good = {i: each for i, each in good.items() if best not in each}
     return tuple(f"{words}, for {', '.join(names)}" for words, names in said.items())
+
+
+def _good(left: Mapping[str, float]) -> Mapping[str, float]:
+    """Of what leaves these parts of a sigma, what is about as good as the best; more of the same where that will do."""
+    least = min(left, key=lambda words: left[words])
+    good = {words: part for words, part in left.items() if _AS_GOOD * part <= left[least] and part < _HELPS}
+    if _SAME in good:
+        return {_SAME: good[_SAME]}
+    return good or {least: left[least]}
+
+
+def _helped(words: str, good: Iterable[Mapping[str, float]]) -> tuple[int, float]:
+    """With how many directions it helps, and by how much with all of them."""
+    parts = [each[words] for each in good if words in each]
+    return len(parts), -sum(parts)
+
+
+def _measurable(result: Refined) -> Iterator[tuple[str, Array]]:
+    """Each inexact known, and by how much more exactly its numbers, of all m, would be known: 1 / sigma^2."""
+    begin = 0
+    for one in result.inexact:
+        precision = np.zeros(len(result.known))
+        precision[begin : begin + len(one.sigmas)] = (_BETTER**2 - 1) / one.sigmas**2
+        begin += len(one.sigmas)
+        yield one.what, precision
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Information on the cell (12, 12), on it together with the m numbers by which knowns are off (12, m), and on these
+    (m, m), what was known of them before included; spread (m, m): their covariance where they are only reckoned with,
+    whatever the captures say of them, else None.
+    """
+
+    cell: Array
+    both: Array
+    numbers: Array
+    spread: Array | None
+
+    @classmethod
+    def of(cls, result: Refined) -> _Known:
+        joint = result.joint_covariance
+        # What is only reckoned with is as uncertain after the estimate as before.
+        if not result.known or any(known.sigma != known.prior for known in result.known):
+            every: Array = np.asarray(np.linalg.inv(joint), dtype=float)
+            return cls(every[:CELL, :CELL], every[:CELL, CELL:], every[CELL:, CELL:], None)
+        spread = joint[CELL:, CELL:]
+        follow = np.linalg.solve(spread, joint[CELL:, :CELL]).T
+        cell: Array = np.asarray(np.linalg.inv(joint[:CELL, :CELL] - follow @ spread @ follow.T), dtype=float)
+        return cls(cell, -cell @ follow, np.zeros_like(spread), spread)
+
+    def sigmas(self) -> Array:
+        """(12,) of the cell, m and rad."""
+        if self.spread is None:
+            every = np.block([[self.cell, self.both], [self.both.T, self.numbers]])
+            return np.asarray(np.sqrt(np.diag(np.linalg.inv(every))[:CELL]))
+        follow = np.linalg.solve(self.cell, self.both)
+        return np.asarray(np.sqrt(np.diag(np.linalg.inv(self.cell) + follow @ self.spread @ follow.T)))
+
+    def with_captures(self, cell: Array, both: Array, numbers: Array) -> _Known:
+        """With information of captures added."""
+        return replace(self, cell=self.cell + cell, both=self.both + both, numbers=self.numbers + numbers)
+
+    def measured(self, precision: Array) -> _Known:
+        """With 1 / sigma^2 (m,) more known of the numbers, by other means than captures."""
+        if self.spread is None:
+            return replace(self, numbers=self.numbers + np.diag(precision))
+        return replace(self, spread=np.linalg.inv(np.linalg.inv(self.spread) + np.diag(precision)))
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """turn, rad, and shift, m, in the camera's frame: one this way and the next one that."""
+    """turn, rad, and shift, m, in the camera's frame, one this way and the next one that: of the camera at arrivals of
+    their own, the boards before it where they are, or of the boards, more of them at the same arrivals.
+    """
 
     words: str
+    arrivals: bool
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def moves(self, count: int) -> Array:
+    def again(self, result: Refined, captures: CaptureArrays) -> CaptureArrays:
+        """As many captures of this kind; one that an arm does not reach is taken where it was."""
+        model = Model(captures, result.knowns, result.noise)
+        knowns, arrival = result.knowns, model.arrival
+        T_E_T = inverse(result.T_P_A @ model.T_A_H @ result.T_H_E)[arrival] @ model.T_P_F @ knowns.T_F_T
+        active = model.active
+        if self.arrivals:
+            moved = model.T_A_H @ result.T_H_E @ self._moves(model.arrivals) @ inverse(result.T_H_E)
+            active, arrival = _reaching(knowns.active, active, moved), arrival + model.arrivals
+        else:
+            moves = self._moves(model.captures)
+            T_E_T = transform(moves[:, :3, :3] @ T_E_T[:, :3, :3], T_E_T[:, :3, 3] + moves[:, :3, 3])
+        T_P_E = (result.T_P_A @ knowns.active.forward(active) @ result.T_H_E)[model.arrival]
+        passive = _reaching(knowns.passive, captures.passive, T_P_E @ T_E_T @ inverse(knowns.T_F_T))
+        there = inverse(T_P_E) @ knowns.passive.forward(passive) @ knowns.T_F_T
+        pixels = project(apply(there, knowns.corners), knowns.matrix, knowns.distortion)
+        return CaptureArrays(
+            active=active[model.arrival],
+            passive=passive,
+            arrivals=arrival,
+            pixels=np.where(np.isfinite(captures.pixels), pixels, np.nan),
+            weights=captures.weights,
+        )
+
+    def _moves(self, count: int) -> Array:
         """(count, 4, 4)."""
         way = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)[:, None]
         return transform(rotation_from_vector(way * self.turn), way * self.shift)
 
 
-# Arrivals again, with the camera moved, the boards before it where they are.
-_ARRIVALS = (
-    _Kind(_SAME),
-    _Kind("constraints with the camera rolled about its optical axis", turn=(0, 0, _TURN)),
-    _Kind("constraints with the camera turned about its x-axis", turn=(_TURN, 0, 0)),
-    _Kind("constraints with the camera turned about its y-axis", turn=(0, _TURN, 0)),
-    _Kind("constraints with the camera farther to the sides", shift=(_SHIFT, _SHIFT, 0)),
-)
-
-# Positions again at the same arrivals, with the boards moved.
-_POSITIONS = (
-    _Kind("more positions on the same constraints"),
-    _Kind("positions at more distances from the camera", shift=(0, 0, _DEPTH)),
-    _Kind("positions with the board tilted more about the camera's x-axis", turn=(_TURN, 0, 0)),
-    _Kind("positions with the board tilted more about the camera's y-axis", turn=(0, _TURN, 0)),
+_KINDS = (
+    _Kind(_SAME, True),
+    _Kind("constraints with the camera rolled about its optical axis", True, turn=(0, 0, _TURN)),
+    _Kind("constraints with the camera turned about its x-axis", True, turn=(_TURN, 0, 0)),
+    _Kind("constraints with the camera turned about its y-axis", True, turn=(0, _TURN, 0)),
+    _Kind("constraints with the camera farther to the sides", True, shift=(_SHIFT, _SHIFT, 0)),
+    _Kind("more positions on the same constraints", False),
+    _Kind("positions at more distances from the camera", False, shift=(0, 0, _DEPTH)),
+    _Kind("positions with the board tilted more about the camera's x-axis", False, turn=(_TURN, 0, 0)),
+    _Kind("positions with the board tilted more about the camera's y-axis", False, turn=(0, _TURN, 0)),
 )
 
 
-def _gains(result: Refined, captures: CaptureArrays) -> Iterator[tuple[str, Array]]:
-    """Information (12, 12) on the cell that each kind adds."""
-    model = Model(captures.turned(result.flipped).only(result.used), result.knowns, result.noise)
-    at = model.linearised(model.state(result.T_P_A, result.T_H_E))
-    for kind in _ARRIVALS:
-        T_A_E = model.T_A_H @ result.T_H_E @ kind.moves(model.arrivals)
-        G = np.concatenate([adjoint(inverse(T_A_E)), np.broadcast_to(np.eye(6), (model.arrivals, 6, 6))], axis=2)
-        yield kind.words, np.sum(np.swapaxes(G, 1, 2) @ at.pose_normal @ G, axis=0)
-    for place in _POSITIONS:
-        yield place.words, _of_positions(model, result, at, place)
+def _reaching(arm: Arm, q: Array, flange: Array) -> Array:
+    """(k, n): joint angles near q that bring the flange there, or q itself; what is no chain of joints stands."""
+    if not isinstance(arm, Chain):
+        return q
+    limits = np.full(arm.joints, np.inf)
+    found, reached = arm.inverse(flange, q, -limits, limits)
+    return np.where(reached[:, None], found, q)
 
 
-def _of_positions(model: Model, result: Refined, at: Linearised, kind: _Kind) -> Array:
-    T_P_E = result.T_P_A @ model.T_A_H[model.arrival] @ result.T_H_E
-    T_E_T = inverse(T_P_E) @ model.T_P_F @ result.knowns.T_F_T
-    moves = kind.moves(model.captures)
-    there = T_E_T.copy()
-    there[:, :3, :3] = moves[:, :3, :3] @ T_E_T[:, :3, :3]
-    there[:, :3, 3] += moves[:, :3, 3]
-    sight = model.sight(there)
-    seen = np.isfinite(sight.squares)
-    normal = np.where(seen[:, None, None], sight.normal, 0.0)
-    none = np.zeros((model.captures, 6))
-    W = marginalised(normal, none, sight.towards_passive, np.zeros(sight.towards_passive.shape[::2]))[0]
-    arrivals = at.arrival_normal.copy()
-    np.add.at(arrivals, model.arrival, W)
-    A = at.towards_active
-    pose = marginalised(arrivals, np.zeros((model.arrivals, 6)), A, np.zeros(A.shape[::2]))[0]
-    G = at.towards_cell
-    gain = np.sum(np.swapaxes(G, 1, 2) @ (pose - at.pose_normal) @ G, axis=0)
-    return np.asarray(gain).reshape(CELL, CELL)
+def _gains(result: Refined, captures: CaptureArrays) -> Iterator[tuple[str, tuple[Array, Array, Array]]]:
+    """Information (12, 12), (12, m) and (m, m) that each kind adds; less where captures scatter more than stated."""
+    taken = captures.turned(result.flipped).only(result.used)
+    taken = replace(taken, arrivals=Model(taken, result.knowns, result.noise).arrival)
+    before = _information(result, taken)
+    for kind in _KINDS:
+        after = _information(result, _together(taken, kind.again(result, taken)))
+        cell, both, numbers = ((b - a) / result.scale for a, b in zip(before, after, strict=True))
+        yield kind.words, (cell, both, numbers)
+
+
+def _information(result: Refined, captures: CaptureArrays) -> tuple[Array, Array, Array]:
+    """Of captures on the cell, on it with the numbers by which knowns are off, and on these."""
+    model = Model(captures, result.knowns, result.noise)
+    state = model.state(result.T_P_A, result.T_H_E)
+    fit = Fit(state, model.linearised(state), True, 0)
+    at_zero = np.zeros(len(result.known))
+    both, numbers, _ = information(captures, result.knowns, result.noise, result.inexact, at_zero, model, fit)
+    return fit.at.normal, both, numbers
+
+
+def _together(first: CaptureArrays, second: CaptureArrays) -> CaptureArrays:
+    weights = None
+    if first.weights is not None and second.weights is not None:
+        weights = np.concatenate([first.weights, second.weights])
+    return CaptureArrays(
+        active=np.concatenate([first.active, second.active]),
+        passive=np.concatenate([first.passive, second.passive]),
+        arrivals=np.concatenate([first.arrivals, second.arrivals]),
+        pixels=np.concatenate([first.pixels, second.pixels]),
+        weights=weights,
+    )

@@ -133,6 +133,15 @@ def test_a_wrong_corner_count_is_said_when_the_cell_is_known(write: Callable[...
     assert problems(path, corners=9) == ["a: corners_px: 8 corners, the target has 9"]
 
 
+def test_where_the_target_was_seen_by_another_program_goes_without_an_image(write: Callable[..., Path]) -> None:
+    pose = {"matrix": [[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.5], [0, 0, 0, 1]]}
+    entry = without(capture(), "feature_px", "corners_px", "image_px") | {"target_in_camera": pose}
+    read = read_captures(write(entry), image_size=(1024, 768)).captures[0]
+    assert read.image_size is None
+    assert "image_px" not in read.to_record()
+    assert CaptureRecord.from_record(read.to_record()).board_pose == read.board_pose
+
+
 def test_all_problems_are_reported_at_once(write: Callable[..., Path]) -> None:
     found = problems(
         write(

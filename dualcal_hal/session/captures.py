@@ -57,7 +57,7 @@ class CaptureRecord:
     constraint: name of the optical axis it belongs to; active_arrival: a new number each time the active arm
     arrived anew (captures that share it share that arm's error); joints: rad, mean of the readings before and after
     the exposure; feature, corners: px in the distorted image, corners by index on the board, None for one that was not
-    seen, or None altogether; image_size: width and height, px; aligned: whether the feature was within the tolerance;
+    seen, or None altogether; image_size: width and height, px, None where there is no image; aligned: whether the feature was within the tolerance;
     order_known: False where two orientations of the pattern fitted; board_pose: of the target, in place of corners that
     another program does not tell; feature and corners are then where the camera would see them, NaN and None until it
     is known.
@@ -72,7 +72,7 @@ class CaptureRecord:
     passive_joints: Joints
     feature: Pixel
     corners: tuple[Pixel | None, ...] | None
-    image_size: tuple[int, int]
+    image_size: tuple[int, int] | None
     aligned: bool = True
     order_known: bool = True
     board_pose: BoardPose | None = None
@@ -84,6 +84,7 @@ class CaptureRecord:
             sight: dict[str, Any] = {"feature_px": list(self.feature), "corners_px": corners}
         else:
             sight = {"target_in_camera": self.board_pose.to_record()}
+        image = {} if self.image_size is None else {"image_px": list(self.image_size)}
         return {
             "id": self.id,
             "use": self.use,
@@ -93,7 +94,7 @@ class CaptureRecord:
             "active_joints_rad": list(self.active_joints),
             "passive_joints_rad": list(self.passive_joints),
             **sight,
-            "image_px": list(self.image_size),
+            **image,
             "aligned": self.aligned,
             "order": "known" if self.order_known else "unknown",
         }
@@ -237,7 +238,7 @@ class _Entry(BaseModel):
     target_in_camera: _BoardPose | None = None
     feature_px: tuple[_Finite, _Finite] | None = None
     corners_px: tuple[tuple[_Finite, _Finite] | None, ...] | None = None
-    image_px: tuple[_Size, _Size]
+    image_px: tuple[_Size, _Size] | None = None
     aligned: Annotated[bool, Field(strict=True)] = True
     order: Literal["known", "unknown"] = "known"
 
@@ -272,14 +273,15 @@ def _entry(record: Any, name: str) -> tuple[_Entry | None, list[Problem]]:
 
 
 def _missing_sight(record: Mapping[str, Any], name: str) -> Iterator[Problem]:
-    """Pixels may be left out where another program says where it saw the target, and nothing else."""
+    """Pixels and the image's size may be left out where another program says where it saw the target."""
     if record.get("target_in_camera") is not None and record.get("corners_px") is None:
         return
-    for key in ("feature_px", "corners_px"):
+    for key in ("feature_px", "corners_px", "image_px"):
         if key not in record:
             yield Problem(name, f"{key}: missing; only an entry with target_in_camera goes without")
-    if "feature_px" in record and record["feature_px"] is None:
-        yield Problem(name, "feature_px: must be a list, not None")
+    for key in ("feature_px", "image_px"):
+        if key in record and record[key] is None:
+            yield Problem(name, f"{key}: must be a list, not None")
 
 
 _WORDS = {
@@ -350,7 +352,7 @@ def _mismatches(
                 yield Problem(capture.id, f"{key}_joints_rad: {len(angles)} joint angles, the arm has {expected}")
     if corners is not None and capture.corners is not None and len(capture.corners) != corners:
         yield Problem(capture.id, f"corners_px: {len(capture.corners)} corners, the target has {corners}")
-    if image_size is not None and capture.image_size != image_size:
+    if image_size is not None and capture.image_size is not None and capture.image_size != image_size:
         what = f"image_px: {_by(capture.image_size)} px, the cell's camera has {_by(image_size)}"
         yield Problem(capture.id, what)
 

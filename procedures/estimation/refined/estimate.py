@@ -78,7 +78,8 @@ class Refined:
     is that of this estimate under the noise which the captures themselves show, where that is larger.
     residuals (k, n, 2): pixels in units of sigma, NaN for corners not seen and captures not used; distances (k,):
     squared Mahalanobis distance of each capture from where the others put it, NaN for those not used; freedoms (k,):
-    its degrees of freedom. flipped (k,): captures taken with their corners from the other end. used (k,).
+    its degrees of freedom. flipped (k,): captures taken with their corners from the other end. used (k,). captures:
+    those used, with their corners in order.
 
     noise, knowns: what was reckoned with; found: what the captures themselves say of the noise, if that was asked for;
     inexact: knowns that were not taken as exact, counted from ``prior``, and known: what they are after the estimate;
@@ -101,6 +102,7 @@ class Refined:
     freedoms: Array
     used: Mask
     flipped: Mask
+    captures: CaptureArrays
     dropped: tuple[Dropped, ...]
     alternatives: tuple[Alternative, ...]
     warnings: tuple[str, ...]
@@ -147,30 +149,24 @@ def refined(
     there = knowns
     if inexact and estimate_inexact:
         # What does not belong is told only once the knowns are about right.
-        there = _with_inexact(data, knowns, noise, _estimate(data, knowns, noise, *fixed), inexact, True).knowns
+        there = _with_inexact(knowns, noise, _estimate(data, knowns, noise, *fixed), inexact, True).knowns
     result, found = _estimate(data, there, noise, *fixed), None
     for _ in range(_NOISE_ROUNDS if estimate_noise else 0):
-        found = find_noise(kept(data, result), there, noise, result.T_P_A, result.T_H_E)
+        found = find_noise(result.captures, there, noise, result.T_P_A, result.T_H_E)
         result = _estimate(data, there, found.noise, *fixed)
     if found is not None:
         result = replace(result, found=found, warnings=(*result.warnings, *_noise_warnings(found)))
     if not inexact:
         return result
-    found_knowns = _with_inexact(data, knowns, result.noise, result, inexact, estimate_inexact)
+    found_knowns = _with_inexact(knowns, result.noise, result, inexact, estimate_inexact)
     return replace(_combined(result, counted_from(given, found_knowns), inexact, fixed[2]), prior=knowns)
 
 
-def kept(data: CaptureArrays, result: Refined) -> CaptureArrays:
-    """Of the captures that were estimated from, those that were used, with their corners in order."""
-    return replace(data, arrivals=_by_reading(data)).turned(result.flipped).only(result.used)
-
-
 def _with_inexact(
-    data: CaptureArrays, knowns: Knowns, noise: Noise, result: Refined, inexact: Sequence[Inexact], estimated: bool
+    knowns: Knowns, noise: Noise, result: Refined, inexact: Sequence[Inexact], estimated: bool
 ) -> WithInexact:
-    used = kept(data, result)
-    start = Model(used, knowns, noise).state(result.T_P_A, result.T_H_E)
-    return fit_inexact(used, knowns, noise, start, inexact, estimated)
+    start = Model(result.captures, knowns, noise).state(result.T_P_A, result.T_H_E)
+    return fit_inexact(result.captures, knowns, noise, start, inexact, estimated)
 
 
 def _combined(result: Refined, found: WithInexact, inexact: Sequence[Inexact], observable: Limits) -> Refined:
@@ -412,6 +408,7 @@ def _result(
         freedoms=search.every.freedom,
         used=used,
         flipped=best.flipped,
+        captures=search.data.turned(best.flipped).only(used),
         dropped=_dropped(search, best),
         alternatives=alternatives,
         warnings=(*warnings, *_warnings(fit, found, scale, alternatives)),

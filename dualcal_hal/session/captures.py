@@ -57,10 +57,10 @@ class CaptureRecord:
     constraint: name of the optical axis it belongs to; active_arrival: a new number each time the active arm
     arrived anew (captures that share it share that arm's error); joints: rad, mean of the readings before and after
     the exposure; feature, corners: px in the distorted image, corners by index on the board, None for one that was not
-    seen, or None altogether; image_size: width and height, px, None where there is no image; aligned: whether the feature was within the tolerance;
-    order_known: False where two orientations of the pattern fitted; board_pose: of the target, in place of corners that
-    another program does not tell; feature and corners are then where the camera would see them, NaN and None until it
-    is known.
+    seen, or None altogether; image_size: width and height, px, None where there is no image; aligned: whether the
+    feature was within the tolerance; order_known: False where two orientations of the pattern fitted; board_pose: of
+    the target, in place of corners that another program does not tell; feature and corners are then where the camera
+    would see them, NaN and None until it is known.
     """
 
     id: str

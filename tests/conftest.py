@@ -8,10 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 # Matrices are small here: a second thread of OpenBLAS only spins, and takes its time from the other worker's tests.
 # It is read when numpy is first imported, also by the processes that tests start.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# How long an example takes is the machine's business.
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 
 _GRACE = 1.0  # s in which a thread that was told to end may do so
 

@@ -14,6 +14,7 @@ from time import monotonic
 import can
 
 COUNTS = 10_000.0  # per radian
+PERIOD = 0.05  # s between two SYNCs; so that a busy machine is not late by three of them
 
 SWITCH_ON_DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
 
@@ -205,7 +206,7 @@ class SmallBus:
                 drive.set_points.append(target)
             drive.taken = bool(word & 0x10)
             if drive.set_point is not None and not word & 0x100:
-                step = max(1, drive.number(0x6081) // 100)
+                step = max(1, round(drive.number(0x6081) * PERIOD))
                 way = drive.set_point - drive.position
                 drive.position += max(-step, min(step, way))
 

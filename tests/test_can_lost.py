@@ -55,7 +55,7 @@ threading.Event().wait()
 def options(mode: str, channel: str) -> CanLink:
     drives = [{"node": node, "counts_per_rad": 1e5} for node in (1, 2)]
     arms = {"left": {"channel": channel, "drives": drives}}
-    return CanLink.model_validate({"interface": "socketcand", "mode": mode, "sync_period_ms": 20, "arms": arms})
+    return CanLink.model_validate({"interface": "socketcand", "mode": mode, "sync_period_ms": 50, "arms": arms})
 
 
 @pytest.fixture

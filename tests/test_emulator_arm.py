@@ -143,7 +143,7 @@ def test_it_comes_to_rest_where_it_is_told_and_reads_in_steps_of_its_encoders() 
         arm = emulated.arms["left"]
         assert not arm.in_motion
         goal = file.cell.active.home + AWAY
-        arm.follow(Ramp(arm.commanded(), goal, 0.4))
+        arm.follow(Ramp(arm.commanded(), goal, 1.0))
         assert arm.in_motion
         wait(lambda: not arm.in_motion)
         read = arm.read()
@@ -207,7 +207,7 @@ def test_being_told_to_stand_where_an_encoder_shows_it_to_is_no_motion() -> None
 def test_a_hold_brings_it_to_rest_on_its_way() -> None:
     with world() as (emulated, file):
         arm, home = emulated.arms["left"], file.cell.active.home
-        arm.follow(Ramp(home, home + 3 * AWAY, 1.0))
+        arm.follow(Ramp(home, home + 3 * AWAY, 4.0))
         wait(lambda: np.max(np.abs(arm.read().positions - home)) > 0.1)
         arm.hold()
         wait(lambda: not arm.in_motion)

@@ -318,15 +318,19 @@ def test_stops_from_many_threads_during_a_motion_all_find_the_arm_standing(exact
     for _ in range(20):
         motion = start(exact, ACTIVE, away(ACTIVE, 0.5))
         confirmed: list[bool] = []
-        threads = [
-            threading.Thread(target=lambda done=confirmed: done.append(robot.stop("test").confirmed)) for _ in range(4)
-        ]
+        together = threading.Barrier(4)
+
+        def stop(done: list[bool] = confirmed, together: threading.Barrier = together) -> None:
+            together.wait(TIMEOUT)
+            done.append(robot.stop("test").confirmed)
+
+        threads = [threading.Thread(target=stop) for _ in range(4)]
         for thread in threads:
             thread.start()
+        for thread in threads:
+            thread.join()  # whoever waits for the motion before that may well bring it to its end first
         with pytest.raises(MotionStopped):
             motion.wait(TIMEOUT)
-        for thread in threads:
-            thread.join()
         assert confirmed == [True] * 4
         assert motion.state is MotionState.STOPPED
         move(exact, ACTIVE, away(ACTIVE, 0.0))

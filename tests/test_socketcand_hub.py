@@ -87,8 +87,9 @@ def python_can(hub: Hub, bus: str = "left") -> Iterator[can.BusABC]:
 
 
 def test_python_cans_clients_hear_each_other_and_not_themselves(hub: Hub) -> None:
-    with python_can(hub) as one, python_can(hub) as other:
-        other.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))  # it listens from now on
+    with Client(hub, "left").listen() as witness, python_can(hub) as one, python_can(hub) as other:
+        other.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))
+        assert witness.frame() == ("7FF", "")  # so it listens from now on
         one.send(can.Message(arbitration_id=0x181, data=[1, 2, 255], is_extended_id=False))
         heard = other.recv(10.0)
         assert heard is not None

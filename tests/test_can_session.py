@@ -273,6 +273,31 @@ def test_closing_within_a_move_lets_drives_come_to_rest_also_where_one_is_silent
     assert states(bus)[0] == SWITCH_ON_DISABLED
 
 
+def test_closing_within_a_move_lets_drives_come_to_rest_also_where_a_cycle_goes_unanswered(enabled, bus, monkeypatch):
+    enabled.move((1.5, 0.0, 0.0), speed=0.8)
+    led = bus.drives[1].targets
+    enabled.until(lambda: led[-1] - led[-2] == pytest.approx(0.8 * PERIOD * COUNTS, abs=1))
+    stop, sync, told, unanswered = enabled.link._cycle.stop, bus._sync, threading.Event(), set()
+
+    def stop_then_no_answer(reason, timeout):
+        done = stop(reason, timeout)
+        told.set()
+        return done
+
+    def once_without_answer(drive):
+        drive.silent = told.is_set() and drive.node not in unanswered
+        sync(drive)
+        if drive.silent:
+            unanswered.add(drive.node)
+
+    monkeypatch.setattr(enabled.link._cycle, "stop", stop_then_no_answer)
+    monkeypatch.setattr(bus, "_sync", once_without_answer)
+    enabled.link.close()
+    assert unanswered == set(NODES)
+    assert led[-1] - led[-2] < 0.2 * PERIOD * COUNTS
+    assert states(bus) == [SWITCH_ON_DISABLED] * 3
+
+
 def test_it_opens_again_after_it_was_closed(arm):
     arm.open()
     arm.link.close()

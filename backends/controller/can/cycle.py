@@ -144,8 +144,8 @@ class Cycle:
 
     @property
     def is_silent(self) -> bool:
-        """Whether no drive answered in the last cycle."""
-        return all(watch.silent for watch in self._watch)
+        """Whether no drive has answered for so many cycles that no motion goes on: one may be late for all."""
+        return all(watch.silent >= STOP_AT for watch in self._watch)
 
     @property
     def silent(self) -> list[str]:

@@ -19,9 +19,11 @@ from procedures.estimation.refined import intrinsics
 from procedures.estimation.refined.arms import Inverted, MeasuredFlange
 from procedures.estimation.refined.as_read import fit_as_read
 from procedures.estimation.refined.breakdown import break_down
+from procedures.estimation.refined.inexact import Known
 from procedures.estimation.refined.left_out import leave_one_out
 from procedures.estimation.refined.motion import in_flange, logarithm, moved
 from procedures.estimation.refined.one_arm import FlangePoses, JointReadings, OneArm, Placement, Views, one_arm
+from procedures.estimation.refined.one_arm_hidden import hidden_of_one_arm
 from tests.cells import PAPER
 
 BOARD = Checkerboard(5, 4, 0.025, 9)
@@ -83,12 +85,12 @@ def random_world(rng: np.random.Generator, placement: Placement, count: int = 12
     return World(placement, random_pose(rng, reach[0]), random_pose(rng, reach[1]), transform(turns, places))
 
 
-def jointed_world(rng: np.random.Generator, placement: Placement, count: int = 12) -> World:
+def jointed_world(rng: np.random.Generator, placement: Placement, count: int = 12, *, chain: Chain = CHAIN) -> World:
     """The same with an arm of known joints, which move by up to 0.25 rad."""
     joints = np.array([0.2, -0.9, 1.1, 0.3, 0.7, -0.4]) + rng.uniform(-0.25, 0.25, (count, 6))
-    flange = CHAIN.forward(joints)
+    flange = chain.forward(joints)
     on_flange, apart = random_pose(rng, 0.05), transform(FACING, [0.0, 0.0, 0.45])
-    there = CHAIN.forward(joints.mean(axis=0)) @ on_flange
+    there = chain.forward(joints.mean(axis=0)) @ on_flange
     if placement is Placement.ON_ARM:
         world = World(placement, on_flange, there @ apart, np.empty(0), joints)
         return replace(world, seen=inverse(flange @ world.camera) @ world.target)
@@ -370,3 +372,62 @@ class TestPrediction:
         predicted = result.spatial_error(point)
         assert predicted.rms == pytest.approx(np.sqrt(np.mean(np.sum(off**2, axis=1))), rel=0.04)
         assert predicted.p95 == pytest.approx(np.percentile(np.linalg.norm(off, axis=1), 95), rel=0.05)
+
+
+HAYATI = Chain((replace(CHAIN.rows[0], d=0.0, beta=0.1), *CHAIN.rows[1:5], replace(CHAIN.rows[5], d=0.0, beta=-0.2)))
+OFF = {
+    "zero of joint 1": (0, "theta"),
+    "d of row 1": (0, "d"),
+    "zero of joint 6": (5, "theta"),
+    "alpha of row 6": (5, "alpha"),
+    "beta of row 6": (5, "beta"),
+    "d of row 6": (5, "d"),
+    "a of row 6": (5, "a"),
+}
+
+
+class TestHidden:
+    """What fits all views as well, and puts camera or target elsewhere."""
+
+    @both_placements
+    @pytest.mark.parametrize("chain", [CHAIN, HAYATI], ids=["plain", "Hayati"])
+    def test_an_arm_that_is_off_so_fits_as_well_and_puts_points_off_by_so_much(
+        self, placement: Placement, chain: Chain
+    ) -> None:
+        world = jointed_world(np.random.default_rng(0), placement, chain=chain)
+        on_arm = placement is Placement.ON_ARM
+        carried, stands = ("camera", "target") if on_arm else ("target", "camera")
+        in_flange = getattr(world, carried)[None, :3, 3]
+        in_base = (world.target[None] if on_arm else chain.forward(world.joints) @ world.target)[:, :3, 3]
+        *told, _ = hidden_of_one_arm(chain, in_base, in_flange)
+        assert len(told) == (6 if chain is CHAIN else 5)
+        for one in told:
+            name, against = one.what.removeprefix("the ").split(" of the arm, against its ")
+            number, number_of_row = OFF[name]
+            rows = list(chain.rows)
+            by = 1e-3 if number_of_row in ("d", "a") else np.radians(0.1)
+            rows[number] = replace(rows[number], **{number_of_row: getattr(rows[number], number_of_row) + by})
+            views = replace(world.views(), arm=JointReadings(Chain(tuple(rows)), world.joints, JOINT))
+            result = one_arm(views, placement, PIXEL)
+            assert result.rms < 1e-4
+            what, points = (carried, in_flange) if against == "flange" else (stands, in_base)
+            there = apply(getattr(result, what) @ inverse(getattr(world, what)), points)
+            error = np.linalg.norm(there - points, axis=1).max()
+            assert error == pytest.approx(one.error, rel=2e-3), one
+
+    def test_a_stated_sigma_is_what_it_is_told_for(self) -> None:
+        known = Known("zero of joint 1 of the arm", "rad", 0.0, 2e-3, 2e-3, False)
+        points = np.array([[0.3, 0.4, 0.9]])
+        assert hidden_of_one_arm(CHAIN, points, points, [known])[0].error == pytest.approx(1e-3)
+
+    @both_placements
+    def test_an_arm_and_a_target_that_are_too_large_alike_are_one_of_them(self, placement: Placement) -> None:
+        world = jointed_world(np.random.default_rng(0), placement)
+        rows = tuple(replace(row, d=1.001 * row.d, a=1.001 * row.a) for row in CHAIN.rows)
+        views = replace(
+            world.views(), arm=JointReadings(Chain(rows), world.joints, JOINT), corners=1.001 * BOARD.corners
+        )
+        result = one_arm(views, placement, PIXEL)
+        assert result.rms < 1e-5
+        np.testing.assert_allclose(result.camera[:3, 3], 1.001 * world.camera[:3, 3], atol=1e-9)
+        np.testing.assert_allclose(result.target[:3, 3], 1.001 * world.target[:3, 3], atol=1e-9)

@@ -6,7 +6,7 @@ What stands is taken for an arm without joints, so that a cell of one arm is one
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -124,6 +124,9 @@ class OneArmProcedureConfig(Section):
     """Largest angle between the target's normal and the line of sight, degrees."""
     clearance_mm: NotNegative = 20.0
     """Smallest distance kept between arm, camera, target and floor, mm."""
+    knowns: Literal["estimate", "propagate"] = "estimate"
+    """What knowns that carry a sigma are: estimated with it as what is known of them, or left as they are and only
+    reckoned with in the result's uncertainty."""
     verification: OneArmVerificationConfig = OneArmVerificationConfig()
     """The proof."""
 

@@ -17,6 +17,7 @@ from dualcal_hal.session.accuracy import (
     DirectionRecord,
     Finite,
     FoundSigmaRecord,
+    HiddenRecord,
     KnownRecord,
     LimitsRecord,
     Record,
@@ -70,12 +71,14 @@ class OneArmNoiseRecord(Record):
 
 
 class OneArmFitRecord(Record):
-    """How the views fit: squares in units of the noise reckoned with, scale, by how much they exceed it where that
-    cannot be chance, and the rms of all corners with the arm as it was read.
+    """How the views fit: squares in units of the noise reckoned with, the probability of as large ones, of corners and
+    of the arm, or larger, scale, by how much they exceed it where that cannot be chance, and the rms of all corners
+    with the arm as it was read.
     """
 
     chi_square: Finite
     degrees_of_freedom: int
+    probability: Finite
     scale: Finite
     rms_px: Finite
 
@@ -105,13 +108,16 @@ class OffRecord(Record):
 
 class OneArmViewRecord(Record):
     """A view that was estimated from. left_out: by an estimate without it; chi_square: its squared distance from where
-    the others put it, in units of sigma, None for a view that was dropped.
+    the others put it, in units of sigma, None for a view that was dropped. rms_px and left_out are None where the
+    target should be behind the camera.
     """
 
     id: str
     used: bool
-    rms_px: Finite
-    left_out: OffRecord
+    turned: bool = False
+    """Whether its corners, whose order is not known, were taken to be listed from the other end."""
+    rms_px: Finite | None
+    left_out: OffRecord | None
     chi_square: Finite | None
     degrees_of_freedom: Finite | None
     residuals_px: tuple[Corner | None, ...]
@@ -119,21 +125,28 @@ class OneArmViewRecord(Record):
 
 
 class VerifiedViewRecord(Record):
-    """A view that was not estimated from: how far it is from its prediction, and that in units of all uncertainty."""
+    """A view that was not estimated from: how far it is from its prediction, and that in units of all uncertainty.
+
+    off is None where the target should be behind the camera; chi_square where that is so of any view.
+    """
 
     id: str
-    off: OffRecord
-    chi_square: Finite
+    off: OffRecord | None
+    chi_square: Finite | None
     degrees_of_freedom: Finite
     residuals_px: tuple[Corner | None, ...]
 
 
 class OneArmVerificationRecord(Record):
-    """Whether the other views are as predicted, by a chi-square with all uncertainty."""
+    """Whether the other views are as predicted, by a chi-square with all uncertainty.
+
+    Where the target should be behind the camera at any of them there is no nominal or no found, and chi_square is the
+    largest number that a file has.
+    """
 
     nominal: OffRecord | None
-    """With the nominal transforms, None where these have the target behind the camera."""
-    found: OffRecord
+    """With the nominal transforms."""
+    found: OffRecord | None
     chi_square: Finite
     degrees_of_freedom: int
     probability: Finite
@@ -171,8 +184,11 @@ class OneArmResult(Record):
     found_noise: tuple[FoundSigmaRecord, ...] | None
     fit: OneArmFitRecord
     predicted_error: PredictedRecord
-    left_out: OffRecord
-    """Over all used views, each predicted by an estimate without it."""
+    cannot_be_seen: tuple[HiddenRecord, ...] = ()
+    """What no view can show, and what it does to a point."""
+    left_out: OffRecord | None
+    """Over all used views, each predicted by an estimate without it; None where that has the target behind the camera.
+    """
     views: tuple[OneArmViewRecord, ...]
     verification: OneArmVerificationRecord | None
     knowns: tuple[KnownRecord, ...]

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from scipy import stats
 
 from dualcal_hal.config import OneArmCell, OneArmConfig
 from dualcal_hal.errors import DegenerateCaptures
-from dualcal_hal.session.accuracy import DirectionRecord, FoundSigmaRecord, LimitsRecord
+from dualcal_hal.session.accuracy import DirectionRecord, FoundSigmaRecord, HiddenRecord, LimitsRecord
 from dualcal_hal.session.captures import CaptureRecord, Captures
 from dualcal_hal.session.one_arm_result import (
     CovarianceRecord,
@@ -23,20 +24,32 @@ from dualcal_hal.session.one_arm_result import (
     TransformRecord,
     VerifiedViewRecord,
 )
+from dualcal_hal.session.plain import LARGEST
 from dualcal_hal.session.result import Rejected, Verdict
-from dualcal_hal.transforms import Array, Mask, inverse
+from dualcal_hal.transforms import Array, Mask, apply, inverse
 from procedures.analysis import Choices
 from procedures.analysis.accuracy import known_records
-from procedures.detection.outcome import corners_from_record
+from procedures.analysis.board_poses import refuse_what_poses_hide
+from procedures.analysis.verification import words_for
 from procedures.estimation import Degenerate
 from procedures.estimation.refined import Limits, Refined
 from procedures.estimation.refined.left_out import LeftOut, leave_one_out, predicted
-from procedures.estimation.refined.one_arm import OneArm, Placement, Views, as_captures, described
-from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, verify
-from procedures.one_arm.fit import estimate, inexact_of, joint_sigma, placement_of, views_of
+from procedures.estimation.refined.one_arm import OneArm, as_captures, described
+from procedures.estimation.refined.one_arm_hidden import hidden_of_one_arm
+from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, in_order, verify
+from procedures.one_arm.fit import estimate, inexact_of, joint_sigma, placement_of, views_of_captures
+from procedures.one_arm.sorting import Sorted, joints_of, sort_out
 
 _FEWEST_MOVED = 2
-"""Views in a row at either end that are dropped, from where something is said to have moved."""
+"""Views in a row at either end that are elsewhere, from where something is said to have moved."""
+
+_FEWEST_OTHERS = 5
+"""Views that fit each other by more than chance."""
+
+_LEAST_PROBABILITY = LEAST_PROBABILITY / 2
+"""Verification views and those calibrated with may either fail a result: each has half of the level."""
+
+_TOLD = 1e-4  # a smaller probability is told as below it
 
 _COMPONENTS = tuple(f"{what} {axis}" for what in ("translation", "rotation") for axis in "xyz")
 
@@ -44,57 +57,77 @@ _COMPONENTS = tuple(f"{what} {axis}" for what in ("translation", "rotation") for
 def analyse_one_arm(captures: Captures, cell: OneArmCell, choices: Choices | None = None) -> OneArmResult:
     """Estimate from the calibration captures, each of them predicted by the others; verify on the rest.
 
-    Raises DegenerateCaptures for captures that do not determine camera and target.
+    Raises DegenerateCaptures for captures that do not determine camera and target, UsageError where captures or cell do
+    not have what the choices need.
     """
     config, choices = cell.one_arm, choices or Choices()
-    calibration, verification = (_of(captures, use) for use in ("calibration", "verification"))
+    refuse_what_poses_hide(captures, cell, choices.free)
+    kinds = sort_out(captures.captures, config)
+    if not kinds.calibration:
+        raise DegenerateCaptures(_nothing_left(kinds))
     placement, inexact = placement_of(config), inexact_of(config, choices.free)
-    views = _views(config, calibration)
+    estimated = config.procedure.knowns == "estimate" or bool(choices.free)
+    views = views_of_captures(cell, kinds.calibration)
     try:
-        result = estimate(config, views, keep_all=choices.keep_all, find_noise=choices.find_noise, inexact=inexact)
+        result = estimate(
+            config,
+            views,
+            keep_all=choices.keep_all,
+            find_noise=choices.find_noise,
+            inexact=inexact,
+            estimate_inexact=estimated,
+        )
         found = described(views, placement, result)
-        left_out = leave_one_out(views, found, inexact)
+        left_out = leave_one_out(views, found, inexact if estimated else ())
     except Degenerate as error:
         raise DegenerateCaptures(f"the views do not tell where camera and target are: {error}") from error
-    proof = _verification(config, placement, result, verification) if verification else None
-    accuracy = _accuracy(config, found, calibration + verification)
-    verdict, reasons = _judge(found, proof, accuracy, _off(left_out, found.used))
-    if moved := _moved(found, calibration):
-        # What holds for the rest of the views need not hold for what comes after.
-        verdict, reasons = "fail", (moved, *reasons)
-    reasons = (*reasons, *found.warnings)
-    return _result(config, found, calibration, left_out, accuracy, proof, verdict=verdict, reasons=reasons)
+    proof = _verification(cell, result, kinds.verification) if kinds.verification else None
+    accuracy = _accuracy(config, found, (*kinds.calibration, *kinds.verification))
+    fit = _fit_record(found, result)
+    moved = tuple(_moved(cell, found, kinds.calibration))
+    verdict, reasons = _judge(moved, fit, proof, accuracy, _off(left_out, found.used))
+    reasons = (*reasons, *found.warnings, *words_for(kinds.rejected))
+    return _result(config, found, kinds, fit, left_out, accuracy, proof, verdict=verdict, reasons=reasons)
 
 
-def _moved(found: OneArm, calibration: Sequence[CaptureRecord]) -> str:
+def _nothing_left(kinds: Sorted) -> str:
+    why = [f"; {one.id}: {one.reason}" for one in kinds.rejected[:1]]
+    return f"there are no calibration captures that can be used{''.join(why)}"
+
+
+def _moved(cell: OneArmCell, found: OneArm, calibration: Sequence[CaptureRecord]) -> Iterator[str]:
     """What is said where it is the last views, or the first, that do not belong to the others; else nothing."""
-    dropped = np.flatnonzero(~found.used)
-    count, views = len(dropped), len(calibration)
-    if count >= _FEWEST_MOVED and dropped[0] == views - count:
-        return f"the views from {calibration[dropped[0]].id} on are elsewhere: target or camera may have moved then"
-    if count >= _FEWEST_MOVED and dropped[-1] == count - 1:
-        return f"the views up to {calibration[dropped[-1]].id} are elsewhere: target or camera may have moved then"
-    return ""
+    views, dropped = len(calibration), np.flatnonzero(~found.used)
+    last = first = 0
+    if found.scale > 1:
+        last = _elsewhere(cell, calibration[::-1])
+        first = 0 if last else _elsewhere(cell, calibration)
+    elif len(dropped) >= _FEWEST_MOVED:
+        last = len(dropped) if dropped[0] == views - len(dropped) else 0
+        first = len(dropped) if dropped[-1] == len(dropped) - 1 else 0
+    if last:
+        yield f"the views from {calibration[-last].id} on are elsewhere: target or camera may have moved then"
+    elif first:
+        yield f"the views up to {calibration[first - 1].id} are elsewhere: target or camera may have moved then"
 
 
-def _of(captures: Captures, use: str) -> list[CaptureRecord]:
-    """Those with corners: nothing else tells where a target is that may be anywhere."""
-    return [capture for capture in captures.captures if capture.use == use and capture.corners is not None]
-
-
-def _views(config: OneArmConfig, captures: Sequence[CaptureRecord]) -> Views:
-    if not captures:
-        raise DegenerateCaptures("there are no calibration captures with corners")
-    corners = [corners_from_record(capture.corners or ()) for capture in captures]
-    return views_of(config, [capture.active_joints or capture.passive_joints for capture in captures], corners)
+def _elsewhere(cell: OneArmCell, calibration: Sequence[CaptureRecord]) -> int:
+    """How many of the first are not where the others put them, if these are more and fit the stated noise."""
+    for count in range(_FEWEST_MOVED, min((len(calibration) + 1) // 2, len(calibration) - _FEWEST_OTHERS + 1)):
+        try:
+            rest = estimate(cell.one_arm, views_of_captures(cell, calibration[count:]), keep_all=True)
+        except Degenerate:
+            return 0
+        if rest.scale == 1.0:
+            others, _ = as_captures(views_of_captures(cell, calibration[:count]), placement_of(cell.one_arm))
+            return 0 if verify(rest, others).fits else count
+    return 0
 
 
 def _accuracy(config: OneArmConfig, found: OneArm, captures: Sequence[CaptureRecord]) -> PredictedRecord:
     """Of points where the camera saw the target."""
-    flange = config.arm.chain.forward([capture.active_joints or capture.passive_joints for capture in captures])
-    carried = inverse(flange) if config.camera_on_arm else flange
-    in_camera = (inverse(found.camera) @ carried @ found.target)[:, :3, 3]
-    there, camera = found.spatial_error(in_camera), found.spatial_error(np.zeros(3))
+    there = found.spatial_error(_targets(config, found, captures)[0])
+    camera = found.spatial_error(np.zeros(3))
     return PredictedRecord(
         camera=PredictedErrorRecord(rms_mm=1e3 * float(camera.rms), p95_mm=1e3 * float(camera.p95)),
         at_target=PredictedErrorRecord(rms_mm=1e3 * float(there.rms.max()), p95_mm=1e3 * float(there.p95.max())),
@@ -102,79 +135,138 @@ def _accuracy(config: OneArmConfig, found: OneArm, captures: Sequence[CaptureRec
     )
 
 
-def _verification(
-    config: OneArmConfig, placement: Placement, result: Refined, captures: Sequence[CaptureRecord]
-) -> OneArmVerificationRecord:
-    views = _views(config, captures)
-    data, knowns = as_captures(views, placement)
+def _targets(config: OneArmConfig, found: OneArm, captures: Sequence[CaptureRecord]) -> tuple[Array, Array]:
+    """(k, 3) m: where the target was at each capture, in the camera and in the arm's base."""
+    flange = config.arm.chain.forward([joints_of(capture) for capture in captures])
+    if config.camera_on_arm:
+        in_base = np.tile(found.target, (len(captures), 1, 1))
+        return (inverse(flange @ found.camera) @ in_base)[:, :3, 3], in_base[:, :3, 3]
+    in_base = flange @ found.target
+    return (inverse(found.camera) @ in_base)[:, :3, 3], in_base[:, :3, 3]
+
+
+def _cannot_be_seen(config: OneArmConfig, found: OneArm, captures: Sequence[CaptureRecord]) -> Iterator[HiddenRecord]:
+    """Against the base where the target was, against the flange at the camera or the target's corners."""
+    carried = found.camera[None, :3, 3] if config.camera_on_arm else apply(found.target, config.target.board.corners)
+    in_base = _targets(config, found, captures)[1]
+    for one in hidden_of_one_arm(config.arm.chain, in_base, carried, found.known):
+        yield HiddenRecord(what=one.what, by=one.by, error_mm=1e3 * one.error)
+
+
+def _verification(cell: OneArmCell, result: Refined, captures: Sequence[CaptureRecord]) -> OneArmVerificationRecord:
+    config = cell.one_arm
+    listed, knowns = as_captures(views_of_captures(cell, captures), placement_of(config))
+    data = in_order(result, listed)
+    turned = ~np.all(np.nan_to_num(data.pixels) == np.nan_to_num(listed.pixels), axis=(1, 2))
     looked_at = verify(result, data)
     off = predicted(data, result.knowns, result.T_P_A, result.T_H_E)
     before = predicted(data, knowns, inverse(config.nominal.target), config.nominal.camera)
     every = np.ones(len(captures), dtype=bool)
     return OneArmVerificationRecord(
-        nominal=_off(before, every) if np.isfinite(before.pixels).any(axis=(1, 2)).all() else None,
+        nominal=_off(before, every),
         found=_off(off, every),
-        chi_square=looked_at.statistic,
+        chi_square=min(looked_at.statistic, LARGEST),
         degrees_of_freedom=looked_at.freedom,
         probability=looked_at.probability,
-        least_probability=LEAST_PROBABILITY,
-        views=tuple(_verified(captures, off, looked_at)),
+        least_probability=_LEAST_PROBABILITY,
+        views=tuple(_verified(captures, off, looked_at, turned)),
     )
 
 
-def _verified(captures: Sequence[CaptureRecord], off: LeftOut, looked_at: Consistency) -> Iterator[VerifiedViewRecord]:
+def _verified(
+    captures: Sequence[CaptureRecord], off: LeftOut, looked_at: Consistency, turned: Mask
+) -> Iterator[VerifiedViewRecord]:
     for k, capture in enumerate(captures):
+        square = float(looked_at.captures[k])
         yield VerifiedViewRecord(
             id=capture.id,
             off=_off(off, np.arange(len(captures)) == k),
-            chi_square=float(looked_at.captures[k]),
+            chi_square=square if np.isfinite(square) else None,
             degrees_of_freedom=float(looked_at.freedoms[k]),
-            residuals_px=_corners(off.pixels[k]),
+            residuals_px=_corners(off.pixels[k], turned=bool(turned[k])),
         )
 
 
-def _off(left_out: LeftOut, chosen: Mask) -> OffRecord:
-    """Over all corners of the chosen (k,) views."""
+def _off(left_out: LeftOut, chosen: Mask) -> OffRecord | None:
+    """Over all corners of the chosen (k,) views; of one that should be behind the camera there is nothing to tell."""
     pixels, at_target = left_out.pixels[chosen], left_out.at_target[chosen]
-    rms = float(np.sqrt(np.nanmean(pixels**2))), float(np.sqrt(np.nanmean(at_target**2)))
+    seen = np.isfinite(at_target)
+    if not seen.any() or not np.isfinite(pixels[seen]).all():
+        return None
+    rms = float(np.sqrt(np.mean(pixels[seen] ** 2))), float(np.sqrt(np.mean(at_target[seen] ** 2)))
     return OffRecord(rms_px=rms[0], rms_mm=1e3 * rms[1])
 
 
 def _judge(
-    found: OneArm, proof: OneArmVerificationRecord | None, accuracy: PredictedRecord, left_out: OffRecord
+    moved: tuple[str, ...],
+    fit: OneArmFitRecord,
+    proof: OneArmVerificationRecord | None,
+    accuracy: PredictedRecord,
+    left_out: OffRecord | None,
 ) -> tuple[Verdict, tuple[str, ...]]:
+    """A misfit widens the covariance, behind which verification views that are off could hide: so it counts too. And
+    where something moved, what holds for the rest of the views need not hold for what comes after.
+    """
     reached, required = accuracy.at_target.p95_mm, accuracy.required_mm
     error = f"predicted 3D error of at most {reached:.2g} mm (95 %) where the camera saw the target"
-    by_others = f"each view predicted by the others: {left_out.rms_px:.2g} px, {left_out.rms_mm:.2g} mm at the target"
-    look_at = "look at whether target and camera are tight, at the joints' zeros, the arm's calibration, the intrinsics"
-    if found.scale > 1:
-        times = found.scale**0.5
-        return "fail", (
-            f"the views do not fit the stated noise: they show {times:.1f} times as much",
-            by_others,
-            look_at,
-        )
+    by_others = f"each view predicted by the others: {_said(left_out)}"
+    misfit = _misfit(fit)
     if proof is None:
-        return "unverified", ("no verification views: nothing shows that the noise is as stated", by_others, error)
-    said = (
-        f"{proof.found.rms_px:.2g} px, {proof.found.rms_mm:.2g} mm at the target, chi-square {proof.chi_square:.0f} of "
-        f"{proof.degrees_of_freedom}, probability {proof.probability:.2g}"
-    )
-    if proof.probability < LEAST_PROBABILITY:
-        what = (
-            f"the {len(proof.views)} verification views are not where they are predicted, for the stated noise: {said}"
+        nothing = "no verification views: nothing shows that the noise is as stated"
+        return "unverified", (*moved, nothing, *misfit, by_others, error)
+    is_off = proof.probability < _LEAST_PROBABILITY
+    said = f"{_said(proof.found)}, {_chance(proof)}"
+    if moved or is_off or fit.probability < _LEAST_PROBABILITY:
+        are = "not where they are predicted, for the stated noise" if is_off else "where they are predicted"
+        verified = f"the {len(proof.views)} verification views are {are}: {said}"
+        look_at = (
+            "look at whether target and camera are tight, at the joints' zeros, the arm's calibration, the intrinsics"
         )
-        return "fail", (what, by_others, look_at)
-    reasons = (f"the {len(proof.views)} verification views are where they are predicted: {said}", by_others)
+        return "fail", (*moved, *((verified, *misfit) if is_off else (*misfit, verified)), by_others, look_at)
+    reasons = (f"the {len(proof.views)} verification views are where they are predicted: {said}", *misfit, by_others)
     if reached > required:
         return "coarse", (f"{error}, above the {required:g} mm required", *reasons)
     return "ok", (f"{error}, within the {required:g} mm required", *reasons)
 
 
+def _misfit(fit: OneArmFitRecord) -> tuple[str, ...]:
+    if fit.scale == 1:
+        return ()
+    times = fit.scale**0.5
+    return (f"the views do not fit the stated noise: they show {times:.1f} times as much; the covariance is widened",)
+
+
+def _said(off: OffRecord | None) -> str:
+    if off is None:
+        return "the target should be behind the camera"
+    return f"{off.rms_px:.2g} px, {off.rms_mm:.2g} mm at the target"
+
+
+def _chance(proof: OneArmVerificationRecord) -> str:
+    chance = f"{proof.probability:.2g}" if proof.probability >= _TOLD else f"below {_TOLD:g}"
+    if proof.chi_square >= LARGEST:
+        return f"probability {chance}"
+    return f"chi-square {proof.chi_square:.0f} of {proof.degrees_of_freedom}, probability {chance}"
+
+
+def _fit_record(found: OneArm, result: Refined) -> OneArmFitRecord:
+    """Corners and arm together, and the arm by itself, may either give a misfit away: Bonferroni's for two."""
+    parts = ((result.cost, result.freedom), (result.between, result.between_freedom))
+    chances = [float(stats.chi2.sf(value, freedom)) for value, freedom in parts if freedom > 0]
+    return OneArmFitRecord(
+        chi_square=found.cost,
+        degrees_of_freedom=found.freedom,
+        probability=min(1.0, len(chances) * min(chances, default=1.0)),
+        scale=found.scale,
+        rms_px=found.rms,
+    )
+
+
 def _result(
     config: OneArmConfig,
     found: OneArm,
-    calibration: Sequence[CaptureRecord],
+    kinds: Sorted,
+    fit: OneArmFitRecord,
     left_out: LeftOut,
     accuracy: PredictedRecord,
     proof: OneArmVerificationRecord | None,
@@ -182,7 +274,7 @@ def _result(
     verdict: Verdict,
     reasons: tuple[str, ...],
 ) -> OneArmResult:
-    limits, names = Limits(), found.placement.names
+    limits, names, calibration = Limits(), found.placement.names, kinds.calibration
     return OneArmResult(
         placement=found.placement.value,
         transforms={name: TransformRecord.of(T) for name, T in found.transforms.items()},
@@ -196,16 +288,18 @@ def _result(
         noise=OneArmNoiseRecord(pixel_px=found.pixel_sigma, joint_mrad=1e3 * found.arm_sigma),
         stated_noise=OneArmNoiseRecord(pixel_px=config.camera.sigma_px, joint_mrad=1e3 * joint_sigma(config)),
         found_noise=_found_noise(found),
-        fit=OneArmFitRecord(
-            chi_square=found.cost, degrees_of_freedom=found.freedom, scale=found.scale, rms_px=found.rms
-        ),
+        fit=fit,
         predicted_error=accuracy,
+        cannot_be_seen=tuple(_cannot_be_seen(config, found, (*calibration, *kinds.verification))),
         left_out=_off(left_out, found.used),
         views=tuple(_view_records(found, calibration, left_out)),
         verification=proof,
         knowns=known_records(found.known),
         captures_used=tuple(c.id for c, used in zip(calibration, found.used, strict=True) if used),
-        captures_rejected=tuple(Rejected(calibration[one.capture].id, one.reason) for one in found.dropped),
+        captures_rejected=(
+            *kinds.rejected,
+            *(Rejected(calibration[one.capture].id, one.reason) for one in found.dropped),
+        ),
         verdict=verdict,
         reasons=reasons,
     )
@@ -236,17 +330,26 @@ def _found_noise(found: OneArm) -> tuple[FoundSigmaRecord, ...] | None:
 
 def _view_records(found: OneArm, captures: Sequence[CaptureRecord], left_out: LeftOut) -> Iterator[OneArmViewRecord]:
     for k, capture in enumerate(captures):
-        known = bool(np.isfinite(found.distances[k]))
+        known, turned = bool(np.isfinite(found.distances[k])), bool(found.flipped[k])
         yield OneArmViewRecord(
             id=capture.id,
             used=bool(found.used[k]),
-            rms_px=float(np.sqrt(np.nanmean(found.residuals[k] ** 2))),
+            turned=turned,
+            rms_px=_rms(found.residuals[k]),
             left_out=_off(left_out, np.arange(len(captures)) == k),
             chi_square=float(found.distances[k]) if known else None,
             degrees_of_freedom=float(found.freedoms[k]) if known else None,
-            residuals_px=_corners(found.residuals[k]),
+            residuals_px=_corners(found.residuals[k], turned=turned),
         )
 
 
-def _corners(residuals: Array) -> tuple[tuple[float, float] | None, ...]:
-    return tuple((float(u), float(v)) if np.isfinite(u) and np.isfinite(v) else None for u, v in residuals)
+def _rms(residuals: Array) -> float | None:
+    """Of those (n, 2) that there are, in each axis; none are of a target that should be behind the camera."""
+    there = residuals[np.isfinite(residuals)]
+    return float(np.sqrt(np.mean(there**2))) if len(there) else None
+
+
+def _corners(residuals: Array, *, turned: bool) -> tuple[tuple[float, float] | None, ...]:
+    """In the order of the capture's corners, from the other end of those that were turned for the estimate."""
+    listed = residuals[::-1] if turned else residuals
+    return tuple((float(u), float(v)) if np.isfinite(u) and np.isfinite(v) else None for u, v in listed)

@@ -7,15 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from dualcal_hal.config import OneArmConfig
+from dualcal_hal.config import OneArmCell, OneArmConfig
 from dualcal_hal.errors import UsageError
 from dualcal_hal.robot import Joints
+from dualcal_hal.session.captures import CaptureRecord
 from dualcal_hal.transforms import Array
-from procedures.analysis.knowns import inexact_knowns
+from procedures.analysis.knowns import arrays, inexact_knowns
 from procedures.estimation.refined import Inexact, Refined
 from procedures.estimation.refined.arms import Inverted
 from procedures.estimation.refined.data import Knowns
 from procedures.estimation.refined.one_arm import JointReadings, Placement, Views, refined_views
+from procedures.one_arm.sorting import joints_of, stops
 
 
 def placement_of(config: OneArmConfig) -> Placement:
@@ -39,6 +41,19 @@ def views_of(config: OneArmConfig, joints: Sequence[Joints], corners: Sequence[A
     )
 
 
+def views_of_captures(cell: OneArmCell, captures: Sequence[CaptureRecord]) -> Views:
+    """With all that captures may say: their order, where another program saw the target, and how exactly."""
+    data, config = arrays(captures, cell), cell.one_arm
+    views = views_of(config, [joints_of(capture) for capture in captures], list(data.pixels))
+    return replace(
+        views,
+        order_known=data.order_known,
+        board_poses=data.board_poses,
+        weights=data.weights,
+        stops=stops(captures, config),
+    )
+
+
 def estimate(
     config: OneArmConfig,
     views: Views,
@@ -46,6 +61,7 @@ def estimate(
     keep_all: bool = False,
     find_noise: bool = False,
     inexact: Sequence[Inexact] = (),
+    estimate_inexact: bool = True,
 ) -> Refined:
     """By the noise that the cell file states, or that the views show; the nominal is one start of several.
 
@@ -61,6 +77,7 @@ def estimate(
         keep_all=keep_all,
         estimate_noise=find_noise,
         inexact=inexact,
+        estimate_inexact=estimate_inexact,
     )
 
 

@@ -14,10 +14,10 @@ from dualcal_hal.camera import Image
 from dualcal_hal.config import OneArmConfig
 from dualcal_hal.session.captures import CaptureRecord
 from dualcal_hal.session.files import write_atomically
-from dualcal_hal.session.one_arm_result import OneArmResult
+from dualcal_hal.session.one_arm_result import OneArmResult, VerifiedViewRecord
 from dualcal_hal.transforms import apply, inverse
 from procedures.report.scene import arm_course
-from procedures.report.style import BLUE, DARK, GREEN, GREY, ORANGE, RED, TEXT, head, host, label
+from procedures.report.style import BLUE, DARK, GREEN, ORANGE, RED, TEXT, head, host, label
 
 if TYPE_CHECKING:  # matplotlib takes a good part of a second to import
     from matplotlib.axes import Axes
@@ -113,7 +113,7 @@ def _draw_residuals(axes: Axes, config: OneArmConfig, captures: Sequence[Capture
     head(axes, f"Residuals: at most {largest:.3f} px")
 
 
-def _proved(result: OneArmResult) -> Sequence[Any]:
+def _proved(result: OneArmResult) -> Sequence[VerifiedViewRecord]:
     return () if result.verification is None else result.verification.views
 
 
@@ -123,18 +123,17 @@ def _draw_errors(axes: Axes, result: OneArmResult) -> None:
     used = [view for view in result.views if view.used]
     dropped = [view for view in result.views if not view.used]
     numbers = iter(range(1, 1 + len(result.views) + len(_proved(result))))
-    for words, values, marker, colour in (
-        ("by the others, estimated from", [view.left_out.rms_mm for view in used], "o", BLUE),
-        ("by the others, dropped", [view.left_out.rms_mm for view in dropped], "x", RED),
-        ("verified", [view.off.rms_mm for view in _proved(result)], "s", ORANGE),
+    for words, offs, marker, colour in (
+        ("by the others, estimated from", [view.left_out for view in used], "o", BLUE),
+        ("by the others, dropped", [view.left_out for view in dropped], "x", RED),
+        ("verified", [view.off for view in _proved(result)], "s", ORANGE),
     ):
-        if values:
-            at = [next(numbers) for _ in values]
-            axes.semilogy(at, values, marker, color=colour, markersize=8, label=words)
+        if offs:
+            # A view whose target should be behind the camera is as far off as none can be shown.
+            values = [np.nan if off is None else off.rms_mm for off in offs]
+            axes.semilogy([next(numbers) for _ in values], values, marker, color=colour, markersize=8, label=words)
     required = result.predicted_error.required_mm
     axes.axhline(required, color=RED, linewidth=2, label=f"accuracy required: {required:g} mm")
-    predicted = result.predicted_error.at_target.p95_mm
-    axes.axhline(predicted, color=GREY, linestyle="--", label=f"predicted 3D error (95 %): {predicted:.2g} mm")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(True, which="major", color="#E3E5E8", linewidth=0.8)
     axes.set_axisbelow(True)
@@ -177,7 +176,7 @@ def _draw_scene(
     axes.plot(x, y, z, color=GREEN, linewidth=1.2, label="line of sight of the first")
     axes.set_aspect("equal")
     axes.view_init(elev=22, azim=-72)
-    head(panel, "Cell in the arm's base", axes)
+    head(panel, "Cell in the arm's base, mm", axes)
 
 
 def _first(number: int) -> str | None:

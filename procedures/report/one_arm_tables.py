@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from rich import box
@@ -12,9 +12,11 @@ from rich.table import Table
 from rich.text import Text
 
 from dualcal_hal.config import OneArmConfig
+from dualcal_hal.session.accuracy import HiddenRecord
 from dualcal_hal.session.one_arm_result import OffRecord, OneArmResult, OneArmVerificationRecord, OneArmViewRecord
 from dualcal_hal.transforms import Array, inverse, vector_from_rotation
 from procedures.planning.plan import Plan, PlannedConstraint
+from procedures.report.accuracy_tables import MOST_HIDDEN
 
 _STYLES = {"ok": "bold green", "fail": "bold red"}
 _WORST = 3
@@ -25,6 +27,8 @@ def one_arm_tables(config: OneArmConfig, result: OneArmResult, truth: Mapping[st
     """All there is to say about a result; truth: both transforms (4, 4) in m by their names, where they are known."""
     parts: list[RenderableType] = [transform_table(config, result, truth), ""]
     parts += [errors_table(result), ""]
+    if result.cannot_be_seen:
+        parts += [_hidden(result.cannot_be_seen), ""]
     return Group(*parts, _outcome(result))
 
 
@@ -81,6 +85,16 @@ def errors_table(result: OneArmResult) -> Table:
     return table
 
 
+def _hidden(cannot_be_seen: Sequence[HiddenRecord]) -> Text:
+    """The largest of it."""
+    ordered = sorted(cannot_be_seen, key=lambda hidden: -hidden.error_mm)
+    lines = ["Cannot be seen in any view, and puts a point off by:"]
+    lines += [f"  {hidden.error_mm:.2f} mm: {hidden.by} of {hidden.what}" for hidden in ordered[:MOST_HIDDEN]]
+    if left := len(ordered) - MOST_HIDDEN:
+        lines.append(f"  and {left} more, all of them in result.json")
+    return Text("\n".join(lines))
+
+
 def _off(off: OffRecord | None) -> tuple[str, str]:
     """Of what would be behind the camera nothing can be said."""
     return ("-", "-") if off is None else (f"{off.rms_px:.3f}", f"{off.rms_mm:.3f}")
@@ -96,16 +110,19 @@ def _outcome(result: OneArmResult) -> Text:
         text.append(f"\n  {reason}")
     if result.verdict == "fail":
         for view in _worst(result):
-            text.append(
-                f"\n  by the others off: {view.id}, {view.left_out.rms_px:.2f} px, {view.left_out.rms_mm:.2f} mm"
-            )
+            text.append(f"\n  by the others off: {view.id}, {_far(view.left_out)}")
     for rejected in result.captures_rejected:
         text.append(f"\n  left out {rejected.id}: {rejected.reason}")
     return text
 
 
 def _worst(result: OneArmResult) -> list[OneArmViewRecord]:
-    return sorted(result.views, key=lambda view: -view.left_out.rms_px)[:_WORST]
+    """Those that should be behind the camera first."""
+    return sorted(result.views, key=lambda view: -np.inf if view.left_out is None else -view.left_out.rms_px)[:_WORST]
+
+
+def _far(off: OffRecord | None) -> str:
+    return "its target should be behind the camera" if off is None else f"{off.rms_px:.2f} px, {off.rms_mm:.2f} mm"
 
 
 def views_table(plan: Plan) -> Table:

@@ -37,15 +37,16 @@ class LeftOut:
 def leave_one_out(views: Views, result: OneArm, inexact: Sequence[Inexact] = ()) -> LeftOut:
     """From the result of ``one_arm`` or ``fit_as_read``, with the same ``inexact`` if they were estimated.
 
-    Of more views than MOST_FITS several are left out at a time, so that time stays linear in them. Views that were
-    dropped are predicted too.
+    Views that share the arm's error are left out together, and of more than MOST_FITS several at a time, so that time
+    stays linear in them. Views that were dropped are predicted too.
     """
     data = as_captures(views, result.placement)[0].turned(result.flipped)
     noise = corners_alone(result) if result.as_read else both(result)
     pixels, at_target = np.full(data.pixels.shape, np.nan), np.full(data.pixels.shape[:2], np.nan)
     number = np.arange(len(views))
-    for fold in range(min(len(views), MOST_FITS)):
-        left = number % MOST_FITS == fold
+    stop = np.unique(data.arrivals, return_inverse=True)[1]
+    for fold in range(min(int(stop.max()) + 1, MOST_FITS)):
+        left = stop % MOST_FITS == fold
         fitted = refit(views, result, result.used & ~left, noise, inexact)
         for view in np.flatnonzero(left & np.any(views.seen, axis=1)):
             one = predicted(data.only(number == view), fitted.knowns, fitted.state.T_P_A, fitted.state.T_H_E)

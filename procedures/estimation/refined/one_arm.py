@@ -18,7 +18,7 @@ from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import Array, Mask, apply, inverse
 from procedures.estimation.degenerate import Degenerate
 from procedures.estimation.refined.arms import Arm, Inverted, MeasuredFlange, NoArm
-from procedures.estimation.refined.data import CaptureArrays, Knowns, Noise, Words
+from procedures.estimation.refined.data import CaptureArrays, Indices, Knowns, Noise, Words
 from procedures.estimation.refined.estimate import Dropped, Refined, refined
 from procedures.estimation.refined.fit import minimise
 from procedures.estimation.refined.geometry import refuse_one_axis
@@ -101,7 +101,8 @@ class Views:
     pixels (k, n, 2): measured corners in the distorted image, NaN for one not seen; corners (n, 3) in the target, m;
     matrix (3, 3), px, and distortion (5,) of the camera; order_known (k,): False where the corners may as well be
     listed from the other end, None: all are known; board_poses: T_camera_target of each view, (4, 4) or its candidates
-    (c, 4, 4), or None; None: none are known.
+    (c, 4, 4), or None; None: none are known; weights (k, 2n, 2n): as those of ``CaptureArrays``; stops (k,): views of
+    one number were taken from where the arm had stopped once, and share its error; None: each has its own.
     """
 
     arm: JointReadings | FlangePoses
@@ -111,6 +112,8 @@ class Views:
     distortion: Array
     order_known: Mask | None = None
     board_poses: Sequence[ArrayLike | None] | None = None
+    weights: Array | None = None
+    stops: Indices | None = None
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -278,15 +281,16 @@ def refined_views(
 
 
 def as_captures(views: Views, placement: Placement) -> tuple[CaptureArrays, Knowns]:
-    """Views as captures that have an arrival each, of a passive arm that is none."""
+    """Views as captures whose arrivals are the arm's stops, of a passive arm that is none."""
     k = len(views)
     data = CaptureArrays(
         active=views.arm.values,
         passive=np.zeros((k, 0)),
-        arrivals=np.arange(k),
+        arrivals=np.arange(k) if views.stops is None else views.stops,
         pixels=views.pixels,
         order_known=views.order_known,
         board_poses=views.board_poses,
+        weights=views.weights,
     )
     arm = views.arm.arm
     return data, Knowns(

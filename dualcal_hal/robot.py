@@ -103,7 +103,10 @@ class Motion:
         return self._error
 
     def on_end(self, listener: Callable[[], None]) -> None:
-        """Call ``listener`` when the motion has ended, on the device's thread; at once if it has."""
+        """Call ``listener`` when the motion has ended, on the device's thread; at once if it has.
+
+        Whoever waits for the motion goes on only once all listeners have been called: a listener must not wait for it.
+        """
         with self._lock:
             if self._state is MotionState.RUNNING:
                 self._listeners.append(listener)
@@ -148,9 +151,11 @@ class Motion:
                 return
             self._state, self._final, self._error = state, final, error
             listeners, self._listeners = self._listeners, []
-        self._ended.set()
-        for listener in listeners:
-            listener()
+        try:
+            for listener in listeners:
+                listener()
+        finally:
+            self._ended.set()
 
 
 class Robot(ABC):

@@ -19,7 +19,7 @@ from dualcal_hal.clock import Clock
 from dualcal_hal.errors import CommandRefused, DeviceError, DeviceTimeout, LinkLost, MotionFailed, NotOpen
 from dualcal_hal.findings import Finding
 from dualcal_hal.limits import JointLimits
-from dualcal_hal.robot import JointPath, Mode, Motion, MotionState, Robot, RobotState, StopResult
+from dualcal_hal.robot import JointPath, Mode, Motion, Robot, RobotState, StopResult
 from dualcal_hal.transforms import Array
 
 STOP_CONFIRMED_WITHIN = 0.5
@@ -116,6 +116,7 @@ class ControlledRobot(Robot):
             motion = Motion(self.name, self._clock)
             following = Following(motion, self._clock, link.begins_within)
             self._following = following
+        motion.on_end(lambda: self._ended(following))
         try:
             now = self._clock.now()
             report = link.report_after(now, now + STATE_TIMEOUT)
@@ -195,8 +196,6 @@ class ControlledRobot(Robot):
         error = error or following.look(report, state)
         if error is not None:
             self._end_by(following, error)
-        elif following.motion.state is MotionState.SETTLED:
-            self._ended(following)
 
     def _on_transfer(self, following: Following, transfer: Transfer) -> None:
         if transfer.error is not None and not following.stopped:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dualcal_hal.transforms import inverse
+from dualcal_hal.transforms import inverse, vector_from_rotation
 from tests.cells import PAPER
 from tests.command_line import dualcal
 from tests.reference_cell import DOCUMENT, EXPECTED, T_H_E, T_P_A, reference
@@ -147,8 +147,8 @@ class TestPosesInPlaceOfCorners:
         [
             (lambda T: np.diag([1, -1, -1, 1]) @ T, "behind the camera"),
             (lambda T: T @ np.diag([1, -1, -1, 1]), "seen from behind"),
-            (lambda T: T * np.array([[1, 1, 1, 1000]] * 3 + [[1, 1, 1, 1]]), "must be m"),
-            (lambda T: T * np.array([[-1, 1, 1, 1]] * 4), "is no rigid transform"),
+            (lambda T: T * np.array([[1, 1, 1, 1000]] * 3 + [[1, 1, 1, 1]]), "lengths are in metres"),
+            (lambda T: T * np.array([[-1, 1, 1, 1]] * 4), "right-handed"),
         ],
         ids=["camera's z backward", "target's z away from the viewer", "in mm", "left-handed"],
     )
@@ -159,3 +159,89 @@ class TestPosesInPlaceOfCorners:
         assert said.startswith("dualcal: calibration/01/1: target_in_camera")
         assert words in said
         assert said.count("\n") == 1
+
+    def test_a_few_digits_of_a_rotation_are_enough(self, tmp_path: Path) -> None:
+        captures = entries(posed=True)
+        for capture in captures:
+            capture["target_in_camera"]["matrix"] = np.round(capture["target_in_camera"]["matrix"], 5).tolist()
+        found = estimated(tmp_path, captures)
+        assert found["verdict"] == "ok"
+        np.testing.assert_allclose(
+            found["transforms"]["camera_in_active_flange"]["matrix"], EXPECTED["camera_in_active_flange"], atol=1e-4
+        )
+
+    def test_a_pose_may_have_any_of_the_forms_of_a_pose(self, tmp_path: Path) -> None:
+        captures = entries(posed=True)
+        for capture in captures:
+            T = np.array(capture["target_in_camera"].pop("matrix"))
+            capture["target_in_camera"]["translation_m"] = T[:3, 3].tolist()
+            capture["target_in_camera"]["rotation_vector_rad"] = vector_from_rotation(T[:3, :3]).tolist()
+        found, same = estimated(tmp_path, captures), estimated(tmp_path, entries(posed=True))
+        for name, transform in same["transforms"].items():
+            np.testing.assert_allclose(found["transforms"][name]["matrix"], transform["matrix"], atol=1e-8)
+
+    def test_the_noise_of_poses_that_say_it_themselves_is_found_as_one_factor(self, tmp_path: Path) -> None:
+        """Exact poses that are said to be uncertain."""
+        found = estimated(tmp_path, entries(posed=True), "--noise", "estimate")["accuracy"]
+        assert found["noise"]["pixel_px"] < 0.01 * found["stated_noise"]["pixel_px"]
+
+    @pytest.mark.parametrize("others", ["corners", "poses alone"])
+    def test_but_not_of_others_as_well(self, tmp_path: Path, others: str) -> None:
+        captures = entries(posed=True)
+        if others == "corners":
+            captures[20:] = entries()[20:]
+        for capture in captures[20:]:
+            capture.get("target_in_camera", {}).pop("covariance", None)
+        said = refusal(tmp_path, captures, "--noise", "estimate")
+        assert said.startswith("dualcal: --noise estimate: 20 of 42 captures, the first calibration/00/0, say")
+        estimated(tmp_path, captures)
+
+
+def with_pose(**changes: Any) -> Entry:
+    (entry, *_) = entries(posed=True)
+    return entry | {"target_in_camera": entry["target_in_camera"] | changes}
+
+
+ODD: dict[str, tuple[Entry, str]] = {
+    "degrees": ({"active_joints_rad": [10.0, -30.0, 95.0, 0.0, 45.0, 170.0]}, "angles are in radians"),
+    "a corner beside the image": ({"corners_px": [[1511.5, 383.5], *[[511.5, 383.5]] * 8]}, "is outside the image of 1024 x 768 px"),
+    "text for a number": ({"passive_joints_rad": [*[0.1] * 5, "0.1"]}, "must be a number, not 0.1"),
+    "no number": ({"feature_px": [float("nan"), 383.5]}, "must be a finite number, not nan"),
+    "a 3 x 3 matrix": (with_pose(matrix=np.eye(3).tolist()), "target_in_camera: matrix is no list of 4 rows"),
+    "a 3 x 4 matrix": (with_pose(matrix=np.eye(4)[:3].tolist()), "target_in_camera: matrix is no list of 4 rows"),
+    "a matrix in a row": (
+        with_pose(matrix=np.eye(4).ravel().tolist()),
+        "target_in_camera: matrix is no list of 4 rows",
+    ),
+    "a list for a pose": ({"target_in_camera": np.eye(4).tolist(), "corners_px": None}, "target_in_camera: must be an"),
+    "no rotation": (with_pose(matrix=np.diag([2.0, 1.0, 1.0, 1.0]).tolist()), "the matrix has no rotation"),
+    "a covariance of translations": (with_pose(covariance=np.eye(3).tolist()), "covariance is no list of 6 rows"),
+    "sigmas for a covariance": (with_pose(covariance=SIGMA), "covariance[0] is no list"),
+    "a negative covariance": (with_pose(covariance=(-np.eye(6)).tolist()), "with variances from 0 up"),
+    "a covariance of an exact pose": (with_pose(covariance=np.zeros((6, 6)).tolist()), "has a direction that is exact"),
+    "one too small to count with": (
+        with_pose(covariance=(1e-38 * np.eye(6)).tolist()),
+        "has a direction that is exact",
+    ),
+    "a singular covariance": (with_pose(covariance=np.full((6, 6), 1e-8).tolist()), "has a direction that is exact"),
+}
+
+
+@pytest.mark.parametrize("what", ODD)
+def test_what_is_odd_is_told_in_one_line_that_names_the_capture(tmp_path: Path, what: str) -> None:
+    change, words = ODD[what]
+    captures = entries()
+    captures[0] |= change
+    if "target_in_camera" in change:
+        del captures[0]["corners_px"]
+    said = refusal(tmp_path, captures)
+    assert said.startswith("dualcal: calibration/00/0: ")
+    assert words in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("least", [1.1e-9, 1e3])
+def test_covariances_however_small_or_large_are_reckoned_with(tmp_path: Path, least: float) -> None:
+    captures = entries(posed=True)
+    captures[0] |= with_pose(covariance=(least**2 * np.eye(6)).tolist())
+    assert estimated(tmp_path, captures)["verdict"] == "ok"

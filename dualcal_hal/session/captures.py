@@ -9,25 +9,35 @@ covariance.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from dualcal_hal.config import CellConfig
 from dualcal_hal.errors import FormatError, Problem
 from dualcal_hal.robot import Joints
 from dualcal_hal.session.files import read_document, write_document
 from dualcal_hal.session.plain import LARGEST
-from dualcal_hal.transforms import is_rotation
+from dualcal_hal.session.triples import pose_of
+from dualcal_hal.transforms import Array
 
 FORMAT = "dualcal.captures/1"
 
 FARTHEST_FEATURE = 2.0
 """px in each axis that the feature point may differ from its corner, which may have been measured in another way."""
+
+LARGEST_ANGLE = 50.0
+"""rad; no joint turns further, and degrees soon are more."""
+
+LEAST_SIGMA = 1e-9
+"""m or rad; a pose that is seen is not more exact."""
+
+_SINGULAR = 1e-9  # of correlations, an eigenvalue
 
 Use = Literal["calibration", "verification"]
 Pixel = tuple[float, float]
@@ -176,6 +186,7 @@ def read_captures(
             entries.append(entry)
             capture = entry.capture(entry.active_arrival or 0)
             problems += _mismatches(capture, joints, corners, image_size)
+            problems += _outside(capture)
             problems += _stray_feature(capture, feature)
     problems += _duplicates([_name(record, index) for index, record in enumerate(raw)] if isinstance(raw, list) else [])
     if problems:
@@ -186,7 +197,16 @@ def read_captures(
 _Finite = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST)]
 _Whole = Annotated[int, Field(strict=True)]
 _Size = Annotated[int, Field(strict=True, gt=0)]
-_Joints = tuple[_Finite, ...]  # none of a stand
+
+
+def _in_radians(angles: Joints) -> Joints:
+    largest = max(map(abs, angles), default=0.0)
+    if largest > LARGEST_ANGLE:
+        raise ValueError(f"an angle of {largest:.4g} rad is {largest / math.tau:.0f} turns: angles are in radians")
+    return angles
+
+
+_Joints = Annotated[tuple[_Finite, ...], AfterValidator(_in_radians)]  # none of a stand
 
 
 def _number_as_name(value: Any) -> Any:
@@ -196,33 +216,22 @@ def _number_as_name(value: Any) -> Any:
 _Name = Annotated[str, Field(strict=True, min_length=1), BeforeValidator(_number_as_name)]
 
 
-_Row4 = tuple[_Finite, _Finite, _Finite, _Finite]
-_Row6 = tuple[_Finite, _Finite, _Finite, _Finite, _Finite, _Finite]
+def _board_pose(value: Any) -> BoardPose | None:
+    if value is None:
+        return None
+    if not isinstance(value, Mapping):
+        raise ValueError("must be an object with a matrix, in m")
+    pose = pose_of(value)
+    if pose.covariance is None:
+        return BoardPose(_rows(pose.T))
+    sigmas = np.sqrt(np.diag(pose.covariance))
+    if sigmas.min() < LEAST_SIGMA or np.linalg.eigvalsh(pose.covariance / np.outer(sigmas, sigmas))[0] < _SINGULAR:
+        raise ValueError(f"the covariance has a direction that is exact; {LEAST_SIGMA:g} m or rad is the least sigma")
+    return BoardPose(_rows(pose.T), _rows(pose.covariance))
 
 
-class _BoardPose(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
-
-    matrix: tuple[_Row4, _Row4, _Row4, _Row4]
-    covariance: tuple[_Row6, _Row6, _Row6, _Row6, _Row6, _Row6] | None = None
-
-    @field_validator("matrix")
-    @classmethod
-    def _is_rigid(cls, value: tuple[_Row4, ...]) -> tuple[_Row4, ...]:
-        if value[3] != (0.0, 0.0, 0.0, 1.0) or not is_rotation(np.array(value)[:3, :3]):
-            raise ValueError("is no rigid transform (4 rows of 4 numbers, m)")
-        return value
-
-    @field_validator("covariance")
-    @classmethod
-    def _is_a_covariance(cls, value: tuple[_Row6, ...] | None) -> tuple[_Row6, ...] | None:
-        if value is None:
-            return None
-        matrix = np.array(value)
-        symmetric = np.allclose(matrix, matrix.T, rtol=1e-6, atol=0.0)
-        if not symmetric or np.linalg.eigvalsh(matrix)[0] <= 0:
-            raise ValueError("is no covariance: it must be symmetric with eigenvalues above 0")
-        return value
+def _rows(matrix: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix.tolist()))
 
 
 class _Entry(BaseModel):
@@ -235,7 +244,7 @@ class _Entry(BaseModel):
     active_arrival: _Whole | None = None
     active_joints_rad: _Joints
     passive_joints_rad: _Joints
-    target_in_camera: _BoardPose | None = None
+    target_in_camera: Annotated[BoardPose | None, BeforeValidator(_board_pose)] = None
     feature_px: tuple[_Finite, _Finite] | None = None
     corners_px: tuple[tuple[_Finite, _Finite] | None, ...] | None = None
     image_px: tuple[_Size, _Size] | None = None
@@ -243,7 +252,6 @@ class _Entry(BaseModel):
     order: Literal["known", "unknown"] = "known"
 
     def capture(self, arrival: int) -> CaptureRecord:
-        pose = self.target_in_camera if self.corners_px is None else None
         return CaptureRecord(
             id=self.id,
             use=self.use,
@@ -257,7 +265,7 @@ class _Entry(BaseModel):
             image_size=self.image_px,
             aligned=self.aligned,
             order_known=self.order == "known",
-            board_pose=None if pose is None else BoardPose(**pose.model_dump()),
+            board_pose=self.target_in_camera if self.corners_px is None else None,
         )
 
 
@@ -300,6 +308,8 @@ def _words(details: Any) -> str:
     where = f"{key}{''.join(f'.{at}' if isinstance(at, str) else f'[{at}]' for at in indices)}"
     if details["type"] == "missing":
         return f"{where}: missing"
+    if details["type"] == "value_error":
+        return f"{where}: {details['ctx']['error']}"
     said = _WORDS.get(details["type"], f"{details['msg'][0].lower()}{details['msg'][1:]}")
     return f"{where}: {said}, not {str(details['input'])[:60]}"
 
@@ -336,6 +346,21 @@ def _stray_feature(capture: CaptureRecord, feature: int | None) -> Iterator[Prob
         return
     if max(abs(corner[0] - capture.feature[0]), abs(corner[1] - capture.feature[1])) > FARTHEST_FEATURE:
         yield Problem(capture.id, f"feature_px: {capture.feature} is not corner {feature} of corners_px, {corner}")
+
+
+def _outside(capture: CaptureRecord) -> Iterator[Problem]:
+    """A pixel that no image has; of several the first."""
+    if capture.image_size is None or capture.board_pose is not None:
+        return
+    pixels = {"feature_px": capture.feature}
+    pixels |= {f"corners_px[{i}]": corner for i, corner in enumerate(capture.corners or ()) if corner is not None}
+    for where, pixel in pixels.items():
+        if any(
+            not -FARTHEST_FEATURE <= x <= size + FARTHEST_FEATURE
+            for x, size in zip(pixel, capture.image_size, strict=True)
+        ):
+            yield Problem(capture.id, f"{where}: {pixel} is outside the image of {_by(capture.image_size)} px")
+            return
 
 
 def _by(size: tuple[int, int]) -> str:

@@ -6,7 +6,7 @@ from dualcal_hal.config import METHODS, CellConfig
 from dualcal_hal.errors import UsageError
 from dualcal_hal.session.captures import Captures
 from dualcal_hal.session.result import Result
-from procedures.analysis.board_poses import refuse_what_poses_hide
+from procedures.analysis.board_poses import refuse_two_kinds_of_noise, refuse_what_poses_hide
 from procedures.analysis.paper import analyse_as_paper
 from procedures.analysis.refined import FREE, Choices, analyse_refined
 
@@ -23,6 +23,8 @@ def analyse(captures: Captures, cell: CellConfig, method: str, choices: Choices 
     if method == "refined":
         choices = choices or Choices()
         refuse_what_poses_hide(captures, cell, choices.free)
+        if choices.find_noise:
+            refuse_two_kinds_of_noise(captures)
         return analyse_refined(captures, cell, choices)
     if method != "paper":
         raise UsageError(f"unknown method '{method}'; there are: {', '.join(METHODS)}")

@@ -13,9 +13,6 @@ from dualcal_hal.session.captures import CaptureRecord, Captures
 from dualcal_hal.transforms import Array, apply, skew
 from procedures.estimation.projection import project, project_with_jacobian
 
-FARTHEST = 100.0
-"""m from the camera; a target that is farther is in other units."""
-
 
 def with_corners(captures: Captures, cell: CellConfig) -> Captures:
     """The same with the corners and the feature point where the camera would see them on a target in that pose.
@@ -32,9 +29,7 @@ def _impossible(captures: Sequence[CaptureRecord], cell: CellConfig) -> Iterator
         if capture.board_pose is None:
             continue
         pose = np.array(capture.board_pose.matrix)
-        if np.linalg.norm(pose[:3, 3]) > FARTHEST:
-            yield Problem(capture.id, f"target_in_camera: is more than {FARTHEST:g} m away; the unit must be m")
-        elif np.any(apply(pose, cell.target.board.corners)[:, 2] <= 0):
+        if np.any(apply(pose, cell.target.board.corners)[:, 2] <= 0):
             yield Problem(capture.id, "target_in_camera: has the target behind the camera, whose z must point forward")
         elif pose[:3, 2] @ pose[:3, 3] >= 0:
             yield Problem(capture.id, "target_in_camera: is seen from behind; the target's z must point to the viewer")
@@ -68,6 +63,18 @@ def refuse_what_poses_hide(captures: Captures, cell: CellConfig, free: Sequence[
         raise UsageError(
             f"{' and '.join(unfit)}: {len(posed)} captures, the first {posed[0]}, have target_in_camera in place of"
             " corners, and a pose does not show lens or squares; go without, or use captures with corners alone"
+        )
+
+
+def refuse_two_kinds_of_noise(captures: Captures) -> None:
+    """UsageError where poses say themselves how exact they are, and other captures do not: what is found of the noise
+    is one factor on all.
+    """
+    stated = [c.id for c in captures.captures if c.board_pose is not None and c.board_pose.covariance is not None]
+    if stated and len(stated) < len(captures.captures):
+        raise UsageError(
+            f"--noise estimate: {len(stated)} of {len(captures.captures)} captures, the first {stated[0]}, say with"
+            " target_in_camera how exact they are, and one sigma is found for all; leave out their covariance"
         )
 
 

@@ -421,6 +421,11 @@ def test_what_is_no_file_of_triples_is_refused(write: Callable[..., Path], conte
     assert any(what in problem for problem in problems(write(content, name)))
 
 
+def test_an_id_is_of_one_triple_also_where_all_stand_in_one_line(write: Callable[..., Path]) -> None:
+    path = write(json.dumps(document(entry(id="a"), entry(id="b"), entry(id="a"))), "one-line.json")
+    assert problems(path) == [f":1: id 'a' is that of {path}:1, too"]
+
+
 def test_a_covariance_is_given_for_all_or_for_none(write: Callable[..., Path]) -> None:
     known = {"matrix": np.eye(4).tolist(), "covariance": np.eye(6).tolist()}
     (problem,) = problems(write(document(entry(B=known), entry())))

@@ -128,8 +128,9 @@ def _require_count(path: Path, count: int) -> None:
 def _duplicates(triples: Sequence[_Triple]) -> Iterator[Problem]:
     first: dict[str, str] = {}
     for triple in triples:
-        if first.setdefault(triple.name, triple.where) != triple.where:
+        if triple.name in first:
             yield Problem(triple.where, f"id {triple.name!r} is that of {first[triple.name]}, too")
+        first.setdefault(triple.name, triple.where)
 
 
 def _from_json(path: Path) -> tuple[list[_Triple], list[Problem]]:

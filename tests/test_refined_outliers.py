@@ -11,6 +11,7 @@ from procedures.estimation.refined.estimate import refined
 from procedures.estimation.refined.fit import minimise
 from procedures.estimation.refined.model import Model
 from procedures.estimation.refined.outliers import distances, predicted_distances
+from tools.benchmarks.misfit import MISFITS, Misfit
 from tools.benchmarks.refined import NOISES, contaminated, misread, reference, sort_out
 
 NOISE = NOISES[0]
@@ -77,6 +78,34 @@ class TestSets:
         data.pixels[7] += 6
         assert refined(data, cell.knowns, NOISE, keep_all=True).used.all()
         assert not refined(data, cell.knowns, NOISE).used[7]
+
+
+class TestMisfit:
+    """Knowns or noise that are other than stated, which puts all captures off."""
+
+    @pytest.mark.parametrize(
+        ("misfit", "seed"),
+        [(MISFITS[0], 1), (MISFITS[1], 18), (MISFITS[2], 1), (MISFITS[3], 5), (MISFITS[5], 6)],
+        ids=["mount", "zeros", "links", "loose", "joint noise"],
+    )
+    def test_it_drops_no_capture_but_is_told(self, misfit: Misfit, seed: int) -> None:
+        cell = reference()
+        found = refined(misfit.drawn(np.random.default_rng(seed), cell), cell.knowns, NOISE)
+        assert found.used.all()
+        assert found.scale > 1
+        assert any("times what the stated noise explains" in words for words in found.warnings)
+
+    def test_what_stands_out_is_dropped_all_the_same(self) -> None:
+        """A capture whose corners are 60 px off, and the mount by 0.5 mm."""
+        cell = reference()
+        data = MISFITS[0].drawn(np.random.default_rng(0), cell)
+        data.pixels[5] += 60
+        assert np.flatnonzero(~refined(data, cell.knowns, NOISE).used).tolist() == [5]
+
+    def test_captures_that_agree_and_are_the_most_are_believed(self) -> None:
+        cell, rng = reference(), np.random.default_rng(0)
+        data, wrong = contaminated(rng, cell.noisy(rng, NOISE), share=0.43)
+        np.testing.assert_array_equal(~refined(data, cell.knowns, NOISE).used, wrong)
 
 
 class TestReasons:

@@ -44,6 +44,14 @@ _APART = 5e-3  # rad
 
 _SUSPICIOUS = 4.0  # squares this many times larger than the noise says: perhaps not the right optimum
 _MOST_ROUNDS = 12
+
+# Captures that are all off, each in its own way, differ more from each other than noisy ones do: an outlier among them
+# is twice as far off as it is among others.
+_STANDS_OUT = 4.0  # a square
+
+# What share may be left out: where all may be off together, and where those that stand out explain all.
+_FEW, _LESS_THAN_HALF = 1 / 3, 0.49
+
 _NOISE_ROUNDS = 2  # what is found for the noise moves the estimate, which hardly moves what is found
 _SIGNIFICANT = 1e-3
 _LARGE = 0.005  # m; a predicted sigma above it is warned of
@@ -212,11 +220,18 @@ def _estimate(
         for T_P_A, T_H_E in further_starts
     ]
     search = _Search(data, every, usable, keep_all)
-    solutions = search.solutions(starts(every, candidates, False), False)
+    plain = starts(every, candidates, False)
+    solutions = search.solutions(plain, False)
     if not solutions or search.suspicious(solutions[0]):
         candidates = camera_candidates(every, data.order, data.board_poses, True)
-        solutions += search.solutions(starts(every, candidates, True) + further, True)
-        solutions = _best_first(solutions)
+        thorough = starts(every, candidates, True) + further
+        solutions = _best_first(solutions + search.solutions(thorough, True))
+        if solutions and not search.explained(solutions[0], _FEW):
+            # Where knowns or noise are wrong all captures are off, and the fewer are left, the better these agree.
+            search = replace(search, farther=_STANDS_OUT)
+            solutions = _best_first(search.solutions(plain, False) + search.solutions(thorough, True))
+            if solutions and not search.explained(solutions[0], _LESS_THAN_HALF):
+                solutions = [one for one in solutions if search.share_out(one) <= _FEW] or solutions
     if not solutions:
         raise Degenerate(
             f"nothing explains the {knowns.words.captures}, even roughly:"
@@ -244,10 +259,22 @@ class _Solution:
 
 @dataclass(frozen=True)
 class _Search:
+    """farther: than the least probable capture that belongs, in squares, is one that does not."""
+
     data: CaptureArrays
     every: Model
     usable: Mask
     keep_all: bool
+    farther: float = 1.0
+
+    def share_out(self, solution: _Solution) -> float:
+        """Of the captures, those left out."""
+        return float(1 - solution.used.sum() / self.usable.sum())
+
+    def explained(self, solution: _Solution, most_out: float) -> bool:
+        """Whether outliers explain all that is off: the others fit the noise, and are enough to be believed."""
+        out = self.share_out(solution)
+        return out == 0 or (out <= most_out and _scale(solution) == 1)
 
     def solutions(self, found: Sequence[Start], only_fitting: bool) -> list[_Solution]:
         """From all starts, best first; only_fitting: at first with the captures that fit the start."""
@@ -297,7 +324,7 @@ class _Search:
         return solution
 
     def _judged(self, solution: _Solution) -> tuple[Mask, Mask]:
-        of_captures, of_arrivals = solution.distances.scale()
+        of_captures, of_arrivals = (self.farther * scale for scale in solution.distances.scale())
         used = solution.used.copy()
         mine = np.flatnonzero(used)
         worst = _worst(solution, of_captures, of_arrivals)
@@ -382,7 +409,7 @@ def _result(
     model, fit, used = best.model, best.fit, best.used
     freedom = model.measurements - CELL
     between, between_freedom = between_arrivals(fit)
-    scale = max(_excess(fit.at.cost, freedom), _excess(between, between_freedom))
+    scale = _scale(best)
     contributions = noise_contributions(fit, model.arrival)
     if scale > 1:
         contributions = _widened(search, best, contributions, scale)
@@ -433,6 +460,12 @@ def _widened(search: _Search, best: _Solution, contributions: dict[str, Array], 
         "passive joints": found.passive / stated.passive,
     }
     return {what: max(1.0, ratios[what]) ** 2 * part for what, part in contributions.items()}
+
+
+def _scale(solution: _Solution) -> float:
+    """By what its squares exceed those of the stated noise, those between arrivals by themselves too."""
+    between = _excess(*between_arrivals(solution.fit))
+    return max(_excess(solution.fit.at.cost, solution.model.measurements - CELL), between)
 
 
 def _excess(squares: float, freedom: int) -> float:

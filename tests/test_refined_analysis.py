@@ -124,6 +124,65 @@ class TestVerdict:
         assert all(map(str.startswith, found.verification.look_at, words))
         assert "nothing else alone explains" in found.verification.look_at[1]
 
+    def test_both_parts_are_told_and_can_be_checked_with_a_table_of_chi_squares(self, tmp_path: Path) -> None:
+        for found in (analyse(noisy(2), cell(), "refined"), analyse(noisy(1), cell(f"{MOUNT}=[0.3, 0, 2]"), "refined")):
+            write_result(tmp_path / "result.json", found)
+            seen = json.loads((tmp_path / "result.json").read_text())["verification"]
+            chances = []
+            for part, freedom, words in (("poses", 84, "boards"), ("corners", 168, "corners on their boards")):
+                numbers = seen[part]
+                assert numbers["degrees_of_freedom"] == freedom
+                chances.append(stats.chi2.sf(numbers["chi_square"], freedom))
+                assert numbers["probability"] == pytest.approx(chances[-1])
+                told = f"{words} chi-square {numbers['chi_square']:.4g} of {freedom}, probability "
+                assert any(told in reason for reason in found.reasons)
+            assert seen["probability"] == pytest.approx(min(1.0, 2 * min(chances)))
+
+    def test_files_of_before_both_parts_were_told_apart_are_read(self, result: Result, tmp_path: Path) -> None:
+        write_result(tmp_path / "result.json", result)
+        document = json.loads((tmp_path / "result.json").read_text())
+        seen = document["verification"]
+        del seen["poses"], seen["corners"], seen["arrivals"]
+        seen |= {"chi_square": 250.0, "degrees_of_freedom": 252.0, "probability": 0.5}
+        (tmp_path / "result.json").write_text(json.dumps(document))
+        again = read_result(tmp_path / "result.json").verification
+        assert again is not None
+        assert (again.poses, again.corners, again.probability) == (None, None, 0.5)
+
+    @pytest.mark.parametrize(
+        ("kept", "words"),
+        [
+            (
+                ("00/",),
+                "7 verification captures at 1 arrival of the active arm prove little: verify at several arrivals",
+            ),
+            (
+                ("00/0",),
+                "1 verification capture at 1 arrival of the active arm proves little: verify at several arrivals",
+            ),
+            (
+                ("00/0", "01/0"),
+                "2 verification captures at 2 arrivals of the active arm prove little: verify at several arrivals",
+            ),
+        ],
+    )
+    def test_few_verification_captures_are_said_to_prove_little(
+        self, kept: tuple[str, ...], words: str, result: Result
+    ) -> None:
+        assert not any("little" in reason for reason in result.reasons)
+        names = tuple(f"verification/{name}" for name in kept)
+        few = tuple(c for c in noisy(1).captures if c.use == "calibration" or c.id.startswith(names))
+        assert words in analyse(replace(noisy(1), captures=few), cell(), "refined").reasons
+
+    def test_calibration_captures_that_do_not_fit_are_told_of_where_the_others_do(self, result: Result) -> None:
+        assert not any("calibration captures themselves" in reason for reason in result.reasons)
+        rough = {c.id: c for c in noisy(3, size=1.6).captures if c.use == "calibration"}
+        mixed = changed(noisy(3), "calibration", lambda c: rough[c.id])
+        found = analyse(mixed, cell(), "refined")
+        assert found.verdict == "ok"
+        told = "yet the calibration captures themselves do not fit the stated noise (chi-square "
+        assert any(told in reason and "something is off that these do not show" in reason for reason in found.reasons)
+
     def test_without_verification_it_is_unverified_and_says_what_is_predicted(self) -> None:
         captures = noisy(1)
         alone = replace(captures, captures=tuple(c for c in captures.captures if c.use == "calibration"))

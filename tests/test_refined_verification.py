@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dualcal_hal.transforms import Array
-from procedures.estimation.refined import refined, target_mount
+from procedures.estimation.refined import refined, target_mount, verification
 from procedures.estimation.refined.data import CaptureArrays
 from procedures.estimation.refined.model import Model
 from procedures.estimation.refined.suspects import next_suspects
@@ -19,10 +19,10 @@ from tools.benchmarks.verification import (
     Check,
     Wrong,
     check,
+    check_uncertain,
     links_off,
     mount_off,
     scatter,
-    together,
     turned_out,
     zero_off,
 )
@@ -45,11 +45,11 @@ class TestGoodSets:
     def test_both_parts_are_chi_squares(self) -> None:
         """Of 50 sets: their means have sigmas of 1.8 and 2.6, the sigmas themselves of 10 %."""
         found = [one.found for one in good()]
-        assert found[0].pose_freedom == 14 * 6
-        assert found[0].corner_freedom == 14 * 12
-        assert np.mean([one.poses for one in found]) == pytest.approx(84, abs=5)
-        assert np.std([one.poses for one in found]) == pytest.approx(np.sqrt(168), rel=0.3)
-        assert np.mean([one.corners for one in found]) == pytest.approx(168, abs=7)
+        assert found[0].poses.freedom == 14 * 6
+        assert found[0].corners.freedom == 14 * 12
+        assert np.mean([one.poses.squares for one in found]) == pytest.approx(84, abs=5)
+        assert np.std([one.poses.squares for one in found]) == pytest.approx(np.sqrt(168), rel=0.3)
+        assert np.mean([one.corners.squares for one in found]) == pytest.approx(168, abs=7)
         assert np.mean([one.captures for one in found]) == pytest.approx(18, abs=0.8)
         assert all(one.fits for one in found)
 
@@ -77,17 +77,12 @@ class TestGoodSets:
         assert found.statistic == pytest.approx(r @ np.linalg.solve(S, r), rel=1e-6)
         np.testing.assert_allclose(found.captures, alone, rtol=1e-6)
 
-    def test_aligned_captures_have_smaller_squares_but_not_by_more_than_is_said(self) -> None:
+    def test_aligned_captures_have_smaller_squares_but_by_no_more_than_two_numbers_of_each_board(self) -> None:
         tolerance = 2 * scatter(OTHER, NOISE)
         plain, chosen = (np.array([one.found.statistic for one in good(each)]) for each in (None, tolerance))
-        hidden = np.mean([one.found.hidden for one in good(tolerance)])
-        assert 2 < hidden < 28
         error = np.sqrt((plain.var() + chosen.var()) / len(plain))
-        assert -2 * error < plain.mean() - chosen.mean() < hidden + 2 * error
+        assert -2 * error < plain.mean() - chosen.mean() < 2 * len(OTHER.data) + 2 * error
         assert all(one.found.fits for one in good(tolerance))
-
-    def test_a_tolerance_that_all_meet_hides_nothing(self) -> None:
-        assert good(100 * scatter(OTHER, NOISE), runs=1)[0].found.hidden == pytest.approx(0, abs=0.2)
 
     def test_what_is_only_reckoned_with_is_reckoned_with_here_too(self) -> None:
         """A mount that is off by as much as its sigma says, which shows in the verification captures' own places."""
@@ -97,9 +92,7 @@ class TestGoodSets:
             taken = [turned_out(cell, true).noisy(rng, NOISE) for cell in (reference(), OTHER)]
             plain = refined(taken[0], reference().knowns, NOISE)
             for estimated in (True, False):
-                result = refined(
-                    taken[0], reference().knowns, NOISE, inexact=[mount], estimate_inexact=estimated, keep_all=True
-                )
+                result = refined(taken[0], reference().knowns, NOISE, inexact=[mount], estimate_inexact=estimated)
                 assert verify(result, taken[1]).fits
             assert not verify(plain, taken[1]).fits
 
@@ -116,9 +109,29 @@ class TestGoodSets:
         data.pixels[5, 1:] = np.nan
         found = judged(data)
         assert found.freedom == 2 * (14 * 9 - 5 - 8)
-        assert found.pose_freedom == 13 * 6 + 2
+        assert found.poses.freedom == 13 * 6 + 2
         assert np.isnan(found.residuals[3, 4:]).all()
         assert found.fits
+
+
+class TestUncertainEstimates:
+    """Of few constraints between which the active flange turns little: predictions bend before the error's end."""
+
+    def test_good_captures_fit_however_far_the_estimate_may_be_off(self) -> None:
+        rng, mount = np.random.default_rng(0), target_mount(3e-3, np.radians(1.0))
+        found = [one for one in (check_uncertain(rng, mount) for _ in range(6)) if one is not None]
+        assert len(found) > 3
+        assert all(sigma > 5 for sigma, _ in found)
+        assert all(one.found.fits for _, one in found)
+        for _, one in found:
+            assert np.mean(one.found.captures) < 1.5 * np.mean(one.found.freedoms)
+
+    def test_nothing_changes_where_predictions_are_linear(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        result = refined(reference().noisy(np.random.default_rng(0), NOISE), reference().knowns, NOISE)
+        data = OTHER.noisy(np.random.default_rng(1), NOISE)
+        linear = verify(result, data)
+        monkeypatch.setattr(verification, "LEAST_PROBABILITY", 2.0)  # which nothing reaches
+        assert verify(result, data).poses.squares == pytest.approx(linear.poses.squares, rel=1e-3)
 
 
 class TestBadSets:
@@ -138,7 +151,7 @@ class TestBadSets:
         assert found.suspects[0].startswith(named)
         assert "would explain the captures" in found.suspects[0]
 
-    def test_looseness_is_named_where_nothing_else_explains(self) -> None:
+    def test_looseness_is_named_where_nothing_else_explains_with_the_joint_sigmas_that_would(self) -> None:
         """Backlash: joints of the passive arm stand off by as much as they can, this way or that."""
         rng, cell = np.random.default_rng(0), reference()
         taken = [each.noisy(rng, NOISE) for each in (cell, OTHER)]
@@ -146,9 +159,37 @@ class TestBadSets:
             data.passive[:] += 6e-4 * rng.choice([-1, 1], data.passive.shape)
         result = refined(taken[0], cell.knowns, NOISE, keep_all=True)
         assert not verify(result, taken[1]).fits
-        suspects = next_suspects(result, together(*taken))
+        suspects = next_suspects(result, taken[0].followed_by(taken[1]))
         assert suspects[0].words.startswith("looseness")
-        assert "nothing else alone explains" in suspects[0].words
+        assert suspects[0].words.endswith("the stated joint sigmas: 5.2 times as much would explain the captures")
+
+    def test_where_not_even_these_would_it_says_so(self) -> None:
+        """A target that slips now and then: most captures are as good as ever."""
+        rng, cell = np.random.default_rng(0), reference()
+        taken = [each.noisy(rng, NOISE) for each in (cell, OTHER)]
+        result = refined(taken[0], cell.knowns, NOISE)
+        for data in taken:
+            slipped = rng.permutation(len(data))[: len(data) // 5]
+            data.passive[slipped] += np.radians(1.0) * rng.choice([-1, 1], (len(slipped), 6))
+        suspects = next_suspects(result, taken[0].followed_by(taken[1]))
+        assert suspects[0].words.startswith("looseness")
+        assert suspects[0].words.endswith("nothing else alone explains the captures")
+
+    def test_gross_errors_of_joints_are_not_laid_at_the_corners(self) -> None:
+        """Boards are then so far from where the fit has them that corners do not follow their motions in proportion."""
+        rng = np.random.default_rng(1)
+        found = check(rng, NOISE, OTHER, None, zero_off(2.0), suspects=True)
+        assert not found.found.fits
+        assert not any(words.startswith("the corners") for words in found.suspects)
+        assert found.suspects[0].startswith("the zeros of the joints")
+
+    def test_no_pixel_sigma_is_named_where_the_corners_of_one_capture_alone_are_off(self) -> None:
+        cell, rng = reference(), np.random.default_rng(0)
+        taken = [each.noisy(rng, NOISE) for each in (cell, OTHER)]
+        result = refined(taken[0], cell.knowns, NOISE)
+        taken[1].pixels[3] += rng.normal(0, 2.0, (9, 2))
+        suspects = next_suspects(result, taken[0].followed_by(taken[1]))
+        assert suspects[0].words.startswith("the corners")
 
     def test_a_capture_and_an_arrival_that_alone_are_off_are_named(self) -> None:
         cell, rng = reference(), np.random.default_rng(0)
@@ -159,19 +200,22 @@ class TestBadSets:
             spoil(data)
             found = verify(result, data)
             assert not found.fits
-            suspects = next_suspects(result, together(cell.noisy(rng, NOISE), data), names)
+            suspects = next_suspects(result, cell.noisy(rng, NOISE).followed_by(data), names)
             assert suspects[0].words.startswith(words)
             assert suspects[0].explains
 
-    def test_corners_off_their_boards_are_told_from_boards_that_are_elsewhere(self) -> None:
+    def test_corners_off_their_boards_are_told_from_boards_elsewhere_with_the_pixel_sigma_that_explains_them(
+        self,
+    ) -> None:
         cell, rng = reference(), np.random.default_rng(0)
-        taken = [each.noisy(rng, replace(NOISE, pixel=0.2)) for each in (cell, OTHER)]
+        taken = [each.noisy(rng, replace(NOISE, pixel=0.25)) for each in (cell, OTHER)]
         result = refined(taken[0], cell.knowns, NOISE)
         found = verify(result, taken[1])
-        assert found.corners > 3 * found.corner_freedom
-        assert found.poses < 3 * found.pose_freedom
+        assert found.corners.squares / found.corners.freedom > 1.5 * found.poses.squares / found.poses.freedom
         assert not found.fits
-        assert next_suspects(result, together(*taken))[0].words.startswith("the corners")
+        suspects = next_suspects(result, taken[0].followed_by(taken[1]))
+        assert suspects[0].words == "the stated pixel sigma: 0.25 px would explain the captures"
+        assert suspects[1].words.startswith("the corners")
 
     def test_a_board_that_should_be_behind_the_camera_is_as_far_off_as_can_be(self) -> None:
         data = OTHER.noisy(np.random.default_rng(1), NOISE)

@@ -173,7 +173,7 @@ class Accuracy(Record):
     directions: tuple[DirectionRecord, ...]
     limits: LimitsRecord
     would_help: tuple[str, ...]
-    """What captures would make the directions seen that are not observable."""
+    """Which captures, or known measured better, would make the directions seen that are not observable."""
     condition: Finite | None
     """Of the whitened problem, None where it is infinite."""
     budget: tuple[SpreadRecord, ...]
@@ -198,15 +198,32 @@ class VerifiedCaptureRecord(Record):
     degrees_of_freedom: Finite
 
 
-class Verification(Record):
-    """The key ``verification``: whether the other captures are as predicted, by a chi-square with all uncertainty."""
+class PartRecord(Record):
+    """Squares in units of all uncertainty, and the probability of as many or more by chance: the chi-square
+    distribution's beyond it.
+    """
 
     chi_square: Finite
-    degrees_of_freedom: Finite
+    degrees_of_freedom: int
     probability: Finite
-    """Of as large a value or a larger one, were all as reckoned with."""
+
+
+class Verification(Record):
+    """The key ``verification``: whether the other captures are as predicted, by two chi-squares with all uncertainty.
+    Both parts are None in files of before they were told apart.
+    """
+
+    poses: PartRecord | None = None
+    """How far the boards are from where they are predicted."""
+    corners: PartRecord | None = None
+    """How far the corners are from one board each, wherever that is."""
+    probability: Finite
+    """That either part is as large or larger by chance: twice the smaller of both probabilities (Bonferroni), at most
+    1; that of the one part where the other has no degrees of freedom."""
     least_probability: Finite
     """Below it the result fails."""
+    arrivals: int | None = None
+    """Of the active arm, at which the captures were taken."""
     captures: tuple[VerifiedCaptureRecord, ...]
     look_at: tuple[str, ...]
     """What to look at next, in this order, where it fails."""

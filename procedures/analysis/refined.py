@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dualcal_hal.config import CellConfig
 from dualcal_hal.errors import DegenerateCaptures, UsageError
-from dualcal_hal.session.accuracy import Accuracy, Verification, VerifiedCaptureRecord
+from dualcal_hal.session.accuracy import Accuracy, PartRecord, Verification, VerifiedCaptureRecord
 from dualcal_hal.session.captures import CaptureRecord, Captures
 from dualcal_hal.session.plain import LARGEST
 from dualcal_hal.session.result import T_H_E_NAME, T_P_A_NAME, Rejected, Result, Unobservable, Verdict
@@ -21,13 +21,14 @@ from procedures.estimation import Degenerate, Statistics, mismatch, statistics
 from procedures.estimation.projection import undistort
 from procedures.estimation.refined import Inexact, Refined, refined
 from procedures.estimation.refined.suspects import Suspect, next_suspects
-from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, verify
+from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, Part, verify
 
 FREE = ("target_mount", "intrinsics")
 """Knowns that can be left to the captures altogether."""
 
 
 _TOLD = 1e-4  # a smaller probability is told as below it
+_FEWEST_CAPTURES, _FEWEST_ARRIVALS = 3, 2  # to verify with; the captures of one arrival share its error
 
 
 @dataclass(frozen=True)
@@ -56,11 +57,12 @@ def analyse_refined(captures: Captures, cell: CellConfig, choices: Choices) -> R
     inexact = inexact_knowns(cell, choices.free)
     found = _estimate(calibration, cell, choices, inexact)
     rejected += tuple(Rejected(calibration[one.capture].id, one.reason) for one in found.dropped)
-    looked_at = _looked_at(verification, cell, found)
+    looked_at = verify(found, arrays(verification, cell)) if verification else None
     region = region_of(cell, verification or calibration)
     accuracy = accuracy_record(found, cell, calibration, [*calibration, *verification], region, stated_noise(cell))
     suspects = _suspects(looked_at, found, calibration, verification, cell)
-    verdict, reasons = _judge(looked_at, suspects, accuracy)
+    seen = None if looked_at is None else _verification_record(looked_at, suspects, verification)
+    verdict, reasons = _judge(seen, accuracy)
     before = mismatch_of(verification, cell, cell.nominal.T_P_A, cell.nominal.T_H_E)
     after = _mismatch_after(verification, cell, found)
     return Result(
@@ -77,7 +79,7 @@ def analyse_refined(captures: Captures, cell: CellConfig, choices: Choices) -> R
         verdict=verdict,
         reasons=(*reasons, *found.warnings, *words_for(rejected)),
         accuracy=accuracy,
-        verification=None if looked_at is None else _verification_record(looked_at, suspects, verification),
+        verification=seen,
     )
 
 
@@ -112,10 +114,6 @@ def _estimate(
         raise DegenerateCaptures(f"the captures do not determine the transforms: {error}") from error
 
 
-def _looked_at(verification: Sequence[CaptureRecord], cell: CellConfig, found: Refined) -> Consistency | None:
-    return verify(found, arrays(verification, cell)) if verification else None
-
-
 def _mismatch_after(verification: Sequence[CaptureRecord], cell: CellConfig, found: Refined) -> Statistics | None:
     """Of the feature point, where the knowns that were found have it, from the line that is seen in the principal point
     which was aligned with: the optical axis, but where intrinsics were found.
@@ -146,26 +144,49 @@ def _suspects(
     return next_suspects(found, arrays(every, cell), [capture.id for capture in every])
 
 
-def _judge(
-    looked_at: Consistency | None, suspects: Sequence[Suspect], accuracy: Accuracy
-) -> tuple[Verdict, tuple[str, ...]]:
+def _judge(seen: Verification | None, accuracy: Accuracy) -> tuple[Verdict, tuple[str, ...]]:
     space = accuracy.error_3d
     predicted = f"predicted 3D error of at most {space.p95_mm:.2g} mm (95 %) in the region"
-    if looked_at is None:
+    if seen is None:
         return "unverified", ("no verification captures: nothing shows that the noise is as stated", predicted)
-    said = (
-        f"chi-square {looked_at.statistic:.0f} of {looked_at.freedom:.0f} on {len(looked_at.captures)} captures,"
-        f" probability {_chance(looked_at.probability)}"
-    )
-    if not looked_at.fits:
+    said = (_said(seen), *_few(seen))
+    if seen.probability < seen.least_probability:
         return "fail", (
-            f"the verification captures are not where they are predicted, for the stated noise: {said}",
-            *(f"look next at {suspect.words}" for suspect in suspects[:1]),
+            f"the verification captures are not where they are predicted, for the stated noise: {said[0]}",
+            *said[1:],
+            *(f"look next at {words}" for words in seen.look_at[:1]),
         )
-    reasons = (f"the verification captures are where they are predicted: {said}",)
+    reasons = (f"the verification captures are where they are predicted: {said[0]}", *said[1:], *_doubts(accuracy))
     if space.p95_mm > space.required_mm:
         return "coarse", (f"{predicted}, above the {space.required_mm:g} mm required", *reasons)
     return "ok", (f"{predicted}, within the {space.required_mm:g} mm required", *reasons)
+
+
+def _said(seen: Verification) -> str:
+    parts = [
+        f"{what} chi-square {part.chi_square:.4g} of {part.degrees_of_freedom}, probability {_chance(part.probability)}"
+        for what, part in (("boards", seen.poses), ("corners on their boards", seen.corners))
+        if part is not None and part.degrees_of_freedom
+    ]
+    both = f"; of either (twice the smaller) {_chance(seen.probability)}" if len(parts) > 1 else ""
+    return f"{'; '.join(parts)}{both}"
+
+
+def _few(seen: Verification) -> Iterator[str]:
+    """Where what the verification captures say is worth little, whatever it is."""
+    captures, arrivals = len(seen.captures), seen.arrivals or 0
+    if captures < _FEWEST_CAPTURES or arrivals < _FEWEST_ARRIVALS:
+        taken = f"{captures} verification capture{'s' * (captures > 1)} at {arrivals} arrival{'s' * (arrivals > 1)}"
+        yield f"{taken} of the active arm prove{'s' * (captures == 1)} little: verify at several arrivals"
+
+
+def _doubts(accuracy: Accuracy) -> Iterator[str]:
+    """Where the calibration captures say otherwise than those of the verification."""
+    fit = accuracy.fit
+    if fit.scale > 1:
+        why = "knowns that are not exact may be why" if accuracy.knowns else "something is off that these do not show"
+        numbers = f"chi-square {fit.chi_square:.0f} of {fit.degrees_of_freedom}"
+        yield f"yet the calibration captures themselves do not fit the stated noise ({numbers}): {why}"
 
 
 def _chance(probability: float) -> str:
@@ -176,10 +197,11 @@ def _verification_record(
     looked_at: Consistency, suspects: Sequence[Suspect], verification: Sequence[CaptureRecord]
 ) -> Verification:
     return Verification(
-        chi_square=_finite(looked_at.statistic),
-        degrees_of_freedom=looked_at.freedom,
-        probability=looked_at.probability if np.isfinite(looked_at.probability) else 0.0,
+        poses=_part_record(looked_at.poses),
+        corners=_part_record(looked_at.corners),
+        probability=looked_at.probability,
         least_probability=LEAST_PROBABILITY,
+        arrivals=len({capture.active_arrival for capture in verification}),
         captures=tuple(
             VerifiedCaptureRecord(id=capture.id, chi_square=_finite(square), degrees_of_freedom=freedom)
             for capture, square, freedom in zip(
@@ -188,6 +210,10 @@ def _verification_record(
         ),
         look_at=tuple(suspect.words for suspect in suspects),
     )
+
+
+def _part_record(part: Part) -> PartRecord:
+    return PartRecord(chi_square=_finite(part.squares), degrees_of_freedom=part.freedom, probability=part.probability)
 
 
 def _finite(value: float) -> float:

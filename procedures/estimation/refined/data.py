@@ -54,6 +54,22 @@ class CaptureArrays:
             weights=None if self.weights is None else self.weights[chosen],
         )
 
+    def followed_by(self, other: CaptureArrays) -> CaptureArrays:
+        """With captures of the same board and arms after them, at arrivals of their own."""
+        both, n = (self, other), 2 * self.pixels.shape[1]
+        apart = int(self.arrivals.max(initial=-1)) - int(other.arrivals.min(initial=0)) + 1
+        poses = [[None] * len(each) if each.board_poses is None else each.board_poses for each in both]
+        weights = [np.tile(np.eye(n), (len(each), 1, 1)) if each.weights is None else each.weights for each in both]
+        return CaptureArrays(
+            active=np.concatenate([self.active, other.active]),
+            passive=np.concatenate([self.passive, other.passive]),
+            arrivals=np.concatenate([self.arrivals, other.arrivals + apart]),
+            pixels=np.concatenate([self.pixels, other.pixels]),
+            order_known=np.concatenate([self.order, other.order]),
+            board_poses=[*poses[0], *poses[1]],
+            weights=None if self.weights is None and other.weights is None else np.concatenate(weights),
+        )
+
     def turned(self, flipped: Mask) -> CaptureArrays:
         """With the corners of the captures where ``flipped`` (k,) is True listed from the other end: the board
         looked at upside down.

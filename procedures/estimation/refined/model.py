@@ -68,11 +68,12 @@ class Linearised:
 @dataclass(frozen=True)
 class Sight:
     """What corners say of T_P_E, passive arm as it is: squares (b,), their sum in units of sigma; normal (b, 6, 6),
-    gradient (b, 6); towards_passive (b, 6, np): how T_P_E would have to move for a sigma of the passive arm. jacobian
-    (b, 2n, 6): of the residuals, in units of sigma.
+    gradient (b, 6); towards_passive (b, 6, np): how T_P_E would have to move for a sigma of the passive arm. residuals
+    (b, 2n), in units of sigma, and their jacobian (b, 2n, 6).
     """
 
     squares: Array
+    residuals: Array
     jacobian: Array
     normal: Array
     gradient: Array
@@ -188,6 +189,7 @@ class Model:
         T_E_F = T_E_T @ inverse(self.knowns.T_F_T)
         return Sight(
             squares=np.sum(r**2, axis=1),
+            residuals=r,
             jacobian=J,
             normal=J_T @ J,
             gradient=(J_T @ r[..., None])[..., 0],

@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
 from dualcal_hal.kinematics import Chain
-from dualcal_hal.transforms import Mask
+from dualcal_hal.transforms import Array, Mask
 from procedures.estimation.degenerate import Degenerate
-from procedures.estimation.refined.data import CaptureArrays
+from procedures.estimation.refined.again import Again, fit_again
+from procedures.estimation.refined.data import CaptureArrays, Noise
 from procedures.estimation.refined.estimate import Refined
-from procedures.estimation.refined.fit import Fit, minimise
-from procedures.estimation.refined.inexact import (
-    Inexact,
-    Known,
-    fit_inexact,
-    joint_zeros,
-    link_parameters,
-    target_mount,
-)
-from procedures.estimation.refined.model import CELL, Model
+from procedures.estimation.refined.inexact import Inexact, Known, joint_zeros, link_parameters, target_mount
+from procedures.estimation.refined.model import CELL
+from procedures.estimation.refined.noise import find_noise
 from procedures.estimation.refined.outliers import distances
 from procedures.estimation.refined.verification import LEAST_PROBABILITY, corner_squares, in_order
 
@@ -33,10 +27,6 @@ _LINK = (0.002, float(np.radians(0.3)))  # m, rad
 
 _MOST_OF_IT = 0.5  # of what is too much
 _LOOSE = "looseness: backlash, sag, a camera or target that is not tight"
-_CORNERS = (
-    "the corners, which are off any board by more than the stated pixel sigma: focus, light, intrinsics, a board that "
-    "is not flat"
-)
 _TOGETHER = "the estimate: all captures together fit one cell, so calibrate with more of them"
 _FEWEST_ARRIVALS = 3
 
@@ -54,9 +44,10 @@ class Suspect:
 
 def next_suspects(result: Refined, captures: CaptureArrays, names: Sequence[str] | None = None) -> tuple[Suspect, ...]:
     """In the order in which to look at them: what explains the captures first, then what explains most of what is too
-    much, then the rest; in each group what is most often wrong in real cells first: the target's mount, the zeros of
-    the joints, the calibration of the arms, a capture or an arrival that alone is off, and what no calibration mends.
-    Before these corners that are off whatever board, and none of these where one cell fits all captures.
+    much, then the rest; in each group what is most often wrong first in real cells: the target's mount, the zeros of
+    the joints, the calibration of the arms, a capture or an arrival that alone is off, and what no calibration mends,
+    which is all the same as joint sigmas that are stated too small. Before these corners that are off whatever board,
+    with the pixel sigma that explains them if one does; and none of these where one cell fits all captures.
 
     captures: all of them, in any order; names: of each, by default its index.
     """
@@ -66,33 +57,47 @@ def next_suspects(result: Refined, captures: CaptureArrays, names: Sequence[str]
         as_given = _fitted(result, captures, result.inexact)
     except (Degenerate, np.linalg.LinAlgError):
         return (Suspect(_LOOSE, 0.0, False),)
-    corners = (Suspect(_CORNERS, 0.0, False),) if as_given.corners_off() else ()
+    corners = (*_pixel_sigma(result, captures, as_given), _CORNERS) if as_given.corners_off() else ()
     if as_given.explains():
         return corners or (Suspect(_TOGETHER, 1.0, True),)
+    if any(suspect.explains for suspect in corners):
+        return corners
     found = [*_knowns(result, captures, as_given), *_left_out(result, captures, as_given, called)]
     explaining = [one for one in found if one.explains]
     mostly = [one for one in found if not one.explains and one.share >= _MOST_OF_IT]
     hardly = [one for one in found if not one.explains and one.share < _MOST_OF_IT]
-    told = _LOOSE if explaining else f"{_LOOSE}; nothing else alone explains the captures"
-    return (*corners, *explaining, *mostly, Suspect(told, 0.0, False), *hardly)
+    loose = Suspect(_LOOSE, 0.0, False) if explaining else _loose(result, captures, as_given)
+    return (*corners, *explaining, *mostly, loose, *hardly)
+
+
+_CORNERS = Suspect(
+    "the corners, which are off any board by more than the stated pixel sigma: focus, light, intrinsics, a board that "
+    "is not flat",
+    0.0,
+    False,
+)
 
 
 @dataclass(frozen=True)
 class _Fitted:
     """Captures fitted with some knowns left to them: squares of boards that are elsewhere than the cell has them, and
-    their degrees of freedom; corners and corner_freedom: those of corners that are elsewhere than their board has them.
+    their degrees of freedom; corners and corner_freedoms (k,): those of corners that are elsewhere than their board has
+    them.
     """
 
-    model: Model
-    fit: Fit
-    known: tuple[Known, ...]
+    again: Again
     squares: float
     freedom: float
-    corners: float
-    corner_freedom: float
+    corners: Array
+    corner_freedoms: Array
 
     def corners_off(self) -> bool:
-        return self.corner_freedom > 0 and bool(stats.chi2.sf(self.corners, self.corner_freedom) < LEAST_PROBABILITY)
+        return bool(stats.chi2.sf(self.corners.sum(), max(self.corner_freedoms.sum(), 1)) < LEAST_PROBABILITY)
+
+    def corners_alike(self) -> bool:
+        """Whether no capture's corners are farther off than chance makes the worst of so many."""
+        chances = stats.chi2.sf(self.corners, np.maximum(self.corner_freedoms, 1))
+        return bool(len(chances) * chances.min() >= LEAST_PROBABILITY)
 
     @property
     def excess(self) -> float:
@@ -111,22 +116,51 @@ class _Fitted:
         return Suspect(what, share, False)
 
 
-def _fitted(result: Refined, captures: CaptureArrays, inexact: Sequence[Inexact]) -> _Fitted:
-    model = Model(captures, result.knowns, result.noise)
-    start = model.state(result.T_P_A, result.T_H_E)
-    known: tuple[Known, ...] = ()
-    if inexact:
-        found = fit_inexact(captures, result.knowns, result.noise, start, inexact, True)
-        model, fit, known = found.model, found.fit, found.known
-    else:
-        fit = minimise(model, start)
-    if not np.isfinite(fit.at.cost):
-        raise Degenerate("a board should be behind the camera")
-    of_corners, ranks = corner_squares(fit.at)
-    corners, boards = float(of_corners.sum()), float(ranks.sum())
-    numbers = sum(1 - min(one.sigma / one.prior, 1.0) ** 2 for one in known)
-    squares = fit.at.cost - corners
-    return _Fitted(model, fit, known, squares, boards - CELL - numbers, corners, model.measurements - boards)
+def _fitted(
+    result: Refined, captures: CaptureArrays, inexact: Sequence[Inexact], noise: Noise | None = None
+) -> _Fitted:
+    again = fit_again(result, captures, inexact, noise)
+    corners, ranks = corner_squares(again.model, again.fit.state)
+    numbers = sum(1 - min(one.sigma / one.prior, 1.0) ** 2 for one in again.known)
+    squares = max(again.fit.at.cost - float(corners.sum()), 0.0)
+    return _Fitted(again, squares, float(ranks.sum()) - CELL - numbers, corners, again.model.freedom - ranks)
+
+
+def _pixel_sigma(result: Refined, captures: CaptureArrays, as_given: _Fitted) -> Iterator[Suspect]:
+    """The one that the corners themselves show, if that alone explains the captures."""
+    ratio = float(np.sqrt(as_given.corners.sum() / as_given.corner_freedoms.sum()))
+    noise = replace(result.noise, pixel=ratio * result.noise.pixel)
+    try:
+        fitted = _fitted(result, captures, result.inexact, noise)
+    except (Degenerate, np.linalg.LinAlgError):
+        return
+    if fitted.explains() and fitted.corners_alike():
+        words = f"{_stated(result)} pixel sigma: {noise.pixel:.2g} px would explain the captures"
+        yield Suspect(words, 1.0, True)
+
+
+def _loose(result: Refined, captures: CaptureArrays, as_given: _Fitted) -> Suspect:
+    """Where no known alone explains the captures: with the joint sigmas that would, if they do for all boards alike."""
+    stated, state = result.noise, as_given.again.fit.state
+    nothing = Suspect(f"{_LOOSE}; nothing else alone explains the captures", 0.0, False)
+    if stated.passive == 0 or as_given.corners_off():
+        return nothing
+    found = find_noise(captures, as_given.again.model.knowns, stated, state.T_P_A, state.T_H_E).noise
+    try:
+        fitted = _fitted(result, captures, result.inexact, replace(found, pixel=stated.pixel))
+        off = distances(fitted.again.model, fitted.again.fit)
+    except (Degenerate, np.linalg.LinAlgError):
+        return nothing
+    boards = off.captures - fitted.corners
+    chances = stats.chi2.cdf(boards, np.maximum(off.freedom - fitted.corner_freedoms, 1))
+    if not fitted.explains() or stats.kstest(chances, "uniform").pvalue < LEAST_PROBABILITY:
+        return nothing
+    times = f"{found.passive / stated.passive:.2g} times as much would explain the captures"
+    return Suspect(f"{_LOOSE}; {_stated(result)} joint sigmas: {times}", 1.0, True)
+
+
+def _stated(result: Refined) -> str:
+    return "the stated" if result.found is None else "the found"
 
 
 def _knowns(result: Refined, captures: CaptureArrays, as_given: _Fitted) -> Iterator[Suspect]:
@@ -148,7 +182,7 @@ def _knowns(result: Refined, captures: CaptureArrays, as_given: _Fitted) -> Iter
             yield Suspect(what, 0.0, False)
             continue
         names = {name for one in inexact for name in one.names}
-        known = [one for one in fitted.known if one.name in names]
+        known = [one for one in fitted.again.known if one.name in names]
         yield fitted.suspect(what, words(known), as_given)
 
 
@@ -169,8 +203,8 @@ def _largest(known: Sequence[Known]) -> str:
 
 def _left_out(result: Refined, captures: CaptureArrays, as_given: _Fitted, called: Sequence[str]) -> Iterator[Suspect]:
     """The capture that fits worst, and the captures of the arrival that does, each left out."""
-    model = as_given.model
-    off = distances(model, as_given.fit)
+    model = as_given.again.model
+    off = distances(model, as_given.again.fit)
     capture = int(np.argmax(off.captures / np.maximum(off.freedom, 1)))
     arrival = model.arrival == int(np.argmax(off.arrivals))
     ids = ", ".join(called[int(k)] for k in np.flatnonzero(arrival))
@@ -182,7 +216,7 @@ def _left_out(result: Refined, captures: CaptureArrays, as_given: _Fitted, calle
 
 
 def _without(result: Refined, captures: CaptureArrays, as_given: _Fitted, what: str, out: Mask) -> Iterator[Suspect]:
-    if len(np.unique(as_given.model.arrival[~out])) < _FEWEST_ARRIVALS:
+    if len(np.unique(as_given.again.model.arrival[~out])) < _FEWEST_ARRIVALS:
         return
     try:
         fitted = _fitted(result, captures.only(~out), result.inexact)

@@ -10,10 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dualcal_hal.cellfile import load_cell
+from dualcal_hal.session.captures import write_captures
 from dualcal_hal.transforms import inverse, vector_from_rotation
+from procedures.one_arm.rehearsal import rehearse_views
 from tests.cells import PAPER
 from tests.command_line import dualcal
+from tests.one_arm_cells import EYE_IN_HAND, SMALL
 from tests.reference_cell import DOCUMENT, EXPECTED, T_H_E, T_P_A, reference
+from tools.benchmarks.one_arm import draw_captures
 
 TCP = PAPER.parent / "paper-tcp.yaml"
 SIGMA = [1e-4, 1e-4, 3e-4, 1e-3, 1e-3, 5e-4]
@@ -89,6 +94,17 @@ class TestRequiredAccuracy:
         cell = self.cell(tmp_path, TCP)
         cell.write_text(cell.read_text().replace("type: controller", "type: ours"))
         assert "required_accuracy_mm: missing" in refusal(tmp_path, entries(), cell=cell)
+
+    def test_nor_where_there_is_one_arm(self, tmp_path: Path) -> None:
+        file = load_cell(EYE_IN_HAND, SMALL)
+        write_captures(tmp_path / "captures.json", draw_captures(file, rehearse_views(file.cell).plan, seed=1))
+        text = file.text.replace("type: simulator", "type: ours")
+        for required, code in ((True, 0), (False, 2)):
+            kept = [line for line in text.splitlines() if required or "required_accuracy_mm" not in line]
+            (tmp_path / "cell.yaml").write_text("\n".join(kept))
+            done = dualcal("estimate", tmp_path)
+            assert done.exit_code == code
+            assert ("required_accuracy_mm: missing" in done.stderr) is not required
 
     def test_where_it_is_said_the_region_is_that_of_the_verification_captures(self, tmp_path: Path) -> None:
         cell = changed_cell(tmp_path, TCP, (line_of(TCP, "required_accuracy_mm"), "    required_accuracy_mm: 2.5\n"))
@@ -204,7 +220,10 @@ def with_pose(**changes: Any) -> Entry:
 
 ODD: dict[str, tuple[Entry, str]] = {
     "degrees": ({"active_joints_rad": [10.0, -30.0, 95.0, 0.0, 45.0, 170.0]}, "angles are in radians"),
-    "a corner beside the image": ({"corners_px": [[1511.5, 383.5], *[[511.5, 383.5]] * 8]}, "is outside the image of 1024 x 768 px"),
+    "a corner beside the image": (
+        {"corners_px": [[1511.5, 383.5], *[[511.5, 383.5]] * 8]},
+        "is outside the image of 1024 x 768 px",
+    ),
     "text for a number": ({"passive_joints_rad": [*[0.1] * 5, "0.1"]}, "must be a number, not 0.1"),
     "no number": ({"feature_px": [float("nan"), 383.5]}, "must be a finite number, not nan"),
     "a 3 x 3 matrix": (with_pose(matrix=np.eye(3).tolist()), "target_in_camera: matrix is no list of 4 rows"),

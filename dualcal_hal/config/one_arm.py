@@ -16,14 +16,7 @@ from dualcal_hal.config.camera import CameraConfig
 from dualcal_hal.config.cell import CellConfig, SessionName
 from dualcal_hal.config.fixtures import FixtureConfig, SolidConfig
 from dualcal_hal.config.nominal import NominalConfig, UncertaintyConfig
-from dualcal_hal.config.procedure import (
-    DEFAULT_ACCURACY_MM,
-    Distances,
-    Looks,
-    ProcedureConfig,
-    Tilt,
-    VerificationConfig,
-)
+from dualcal_hal.config.procedure import Distances, Looks, ProcedureConfig, Tilt, VerificationConfig
 from dualcal_hal.config.references import (
     Location,
     backend_problems,
@@ -102,11 +95,6 @@ class OneArmVerificationConfig(Section):
     required_accuracy_mm: Positive | None = None
     """What the predicted 3D error (95 %) of a point that the camera sees where the target was may be, mm; 1 where left
     out, which only a cell that is simulated may."""
-
-    @property
-    def required_accuracy(self) -> float:
-        """Metres."""
-        return (self.required_accuracy_mm or DEFAULT_ACCURACY_MM) / 1000
 
 
 class OneArmProcedureConfig(Section):

@@ -73,10 +73,6 @@ class VerificationConfig(Section):
         return self.limit_mm / 1000
 
 
-DEFAULT_ACCURACY_MM = 1.0
-"""What is required of a simulated cell that does not say."""
-
-
 def _known_method(value: str) -> str:
     if value not in METHODS:
         raise ValueError(f"unknown method '{value}'; there are: {', '.join(METHODS)}")

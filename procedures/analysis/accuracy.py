@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from dualcal_hal.config import CellConfig
-from dualcal_hal.config.procedure import DEFAULT_ACCURACY_MM
 from dualcal_hal.errors import UsageError
 from dualcal_hal.registry import is_simulated
 from dualcal_hal.session.accuracy import (
@@ -34,6 +33,9 @@ from procedures.estimation.refined.guidance import would_help
 from procedures.estimation.refined.hidden import hidden
 from procedures.estimation.refined.uncertainty import spatial_error
 
+_DEFAULT_ACCURACY_MM = 1.0
+"""What is required of a simulated cell that does not say."""
+
 _MAP = (7, 7, 5)
 """Points of the map along x, y and z."""
 
@@ -55,7 +57,7 @@ def required_accuracy_mm(cell: CellConfig) -> float:
             "procedure.verification.required_accuracy_mm: missing, and only a cell that is simulated goes without;"
             " write it into a copy of the cell file and name that with --cell"
         )
-    return DEFAULT_ACCURACY_MM
+    return _DEFAULT_ACCURACY_MM
 
 
 def region_of(cell: CellConfig, captures: Sequence[CaptureRecord]) -> Array:

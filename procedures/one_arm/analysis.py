@@ -28,8 +28,8 @@ from dualcal_hal.session.plain import LARGEST
 from dualcal_hal.session.result import Rejected, Verdict
 from dualcal_hal.transforms import Array, Mask, apply, inverse
 from procedures.analysis import Choices
-from procedures.analysis.accuracy import known_records
-from procedures.analysis.board_poses import refuse_what_poses_hide
+from procedures.analysis.accuracy import known_records, required_accuracy_mm
+from procedures.analysis.board_poses import refuse_two_kinds_of_noise, refuse_what_poses_hide
 from procedures.analysis.verification import words_for
 from procedures.estimation import Degenerate
 from procedures.estimation.refined import Limits, Refined
@@ -62,6 +62,8 @@ def analyse_one_arm(captures: Captures, cell: OneArmCell, choices: Choices | Non
     """
     config, choices = cell.one_arm, choices or Choices()
     refuse_what_poses_hide(captures, cell, choices.free)
+    if choices.find_noise:
+        refuse_two_kinds_of_noise(captures)
     kinds = sort_out(captures.captures, config)
     if not kinds.calibration:
         raise DegenerateCaptures(_nothing_left(kinds))
@@ -82,7 +84,7 @@ def analyse_one_arm(captures: Captures, cell: OneArmCell, choices: Choices | Non
     except Degenerate as error:
         raise DegenerateCaptures(f"the views do not tell where camera and target are: {error}") from error
     proof = _verification(cell, result, kinds.verification) if kinds.verification else None
-    accuracy = _accuracy(config, found, (*kinds.calibration, *kinds.verification))
+    accuracy = _accuracy(cell, found, (*kinds.calibration, *kinds.verification))
     fit = _fit_record(found, result)
     moved = tuple(_moved(cell, found, kinds.calibration))
     verdict, reasons = _judge(moved, fit, proof, accuracy, _off(left_out, found.used))
@@ -124,14 +126,14 @@ def _elsewhere(cell: OneArmCell, calibration: Sequence[CaptureRecord]) -> int:
     return 0
 
 
-def _accuracy(config: OneArmConfig, found: OneArm, captures: Sequence[CaptureRecord]) -> PredictedRecord:
+def _accuracy(cell: OneArmCell, found: OneArm, captures: Sequence[CaptureRecord]) -> PredictedRecord:
     """Of points where the camera saw the target."""
-    there = found.spatial_error(_targets(config, found, captures)[0])
+    there = found.spatial_error(_targets(cell.one_arm, found, captures)[0])
     camera = found.spatial_error(np.zeros(3))
     return PredictedRecord(
         camera=PredictedErrorRecord(rms_mm=1e3 * float(camera.rms), p95_mm=1e3 * float(camera.p95)),
         at_target=PredictedErrorRecord(rms_mm=1e3 * float(there.rms.max()), p95_mm=1e3 * float(there.p95.max())),
-        required_mm=1e3 * config.procedure.verification.required_accuracy,
+        required_mm=required_accuracy_mm(cell),
     )
 
 

@@ -124,3 +124,11 @@ class TestReasons:
         assert "sigma (rms)" in reasons[9]
         assert "active arm stood elsewhere" in reasons[20]
         assert "no corner was seen" in reasons[27]
+
+    def test_a_board_that_should_be_behind_the_camera_is_said_to_be_there(self) -> None:
+        cell = reference()
+        data = cell.noisy(np.random.default_rng(0), NOISE)
+        data.passive[14, 0] += 1.5
+        (dropped,) = refined(data, cell.knowns, NOISE).dropped
+        assert dropped.capture == 14
+        assert dropped.reason == "its board should be behind the camera, by where the other captures put it"

@@ -92,7 +92,8 @@ class Refined:
     noise, knowns: what was reckoned with; found: what the captures themselves say of the noise, if that was asked for;
     inexact: knowns that were not taken as exact, counted from ``prior``, and known: what they are after the estimate;
     joint_covariance (12 + m, 12 + m): of the cell with their m numbers. contributions: to the covariance (12, 12), of
-    pixels, of the joints of both arms and of each inexact known.
+    pixels, of the joints of both arms and of each inexact known. Captures used, squares, residuals and scale are those
+    of the fit in which the inexact knowns are where they fit best, if they are only reckoned with too.
     """
 
     T_P_A: Array
@@ -146,17 +147,17 @@ def refined(
     keep_all: no capture is dropped however badly it fits. estimate_noise: the sigmas are found from the captures; of
     ``noise`` only the ratio of both arms counts then, and where to begin. Raises Degenerate for captures that do not
     determine both transforms. inexact: knowns with a sigma, estimated with it as their prior, or else only reckoned
-    with in the covariance; Degenerate too for one that is free and cannot be seen. A target mount that is free is
-    sought without what is given of it.
+    with in the covariance; one that is free is estimated anyway, and Degenerate is raised if it cannot be seen. A
+    target mount that is free is sought without what is given of it.
     """
     fixed = (further_starts, keep_all, observable or Limits())
     given = knowns
-    if estimate_inexact and any(is_free_mount(one) for one in inexact):
+    if any(is_free_mount(one) for one in inexact):
         mount = find_mount(data, knowns, noise)
         knowns = given if mount is None else replace(given, T_F_T=mount)
     there = knowns
-    if inexact and estimate_inexact:
-        # What does not belong is told only once the knowns are about right.
+    if inexact:
+        # What does not belong, and how large the noise is, is told only once the knowns are about right.
         there = _with_inexact(knowns, noise, _estimate(data, knowns, noise, *fixed), inexact, True).knowns
     result, found = _estimate(data, there, noise, *fixed), None
     for _ in range(_NOISE_ROUNDS if estimate_noise else 0):
@@ -164,10 +165,10 @@ def refined(
         result = _estimate(data, there, found.noise, *fixed)
     if found is not None:
         result = replace(result, found=found, warnings=(*result.warnings, *_noise_warnings(found)))
-    if not inexact:
-        return result
-    found_knowns = _with_inexact(knowns, result.noise, result, inexact, estimate_inexact)
-    return replace(_combined(result, counted_from(given, found_knowns), inexact, fixed[2]), prior=knowns)
+    if inexact:
+        found_knowns = _with_inexact(knowns, result.noise, result, inexact, estimate_inexact)
+        result = replace(_combined(result, counted_from(given, found_knowns), inexact, fixed[2]), prior=knowns)
+    return replace(result, warnings=(*_uncertain(result.directions), *result.warnings))
 
 
 def _with_inexact(
@@ -438,7 +439,7 @@ def _result(
         captures=search.data.turned(best.flipped).only(used),
         dropped=_dropped(search, best),
         alternatives=alternatives,
-        warnings=(*warnings, *_warnings(fit, found, scale, alternatives)),
+        warnings=(*warnings, *_warnings(fit, scale, alternatives)),
         noise=search.every.noise,
         knowns=search.every.knowns,
         prior=search.every.knowns,
@@ -475,10 +476,8 @@ def _excess(squares: float, freedom: int) -> float:
     return max(1.0, squares / freedom)
 
 
-def _warnings(fit: Fit, found: Sequence[Direction], scale: float, alternatives: Sequence[Alternative]) -> list[str]:
+def _uncertain(found: Sequence[Direction]) -> list[str]:
     words = []
-    if not fit.converged:
-        words.append("the estimate has not converged")
     large = [d for d in found if d.name.startswith("translation") and d.sigma > _LARGE]
     if large:
         names = ", ".join(f"{d.name} by {1e3 * d.sigma:.1f} mm" for d in large)
@@ -486,6 +485,13 @@ def _warnings(fit: Fit, found: Sequence[Direction], scale: float, alternatives: 
     hidden = [d.name for d in found if not d.observable and d not in large]
     if hidden:
         words.append(f"not observable: {', '.join(hidden)}")
+    return words
+
+
+def _warnings(fit: Fit, scale: float, alternatives: Sequence[Alternative]) -> list[str]:
+    words = []
+    if not fit.converged:
+        words.append("the estimate has not converged")
     if scale > 1:
         words.append(
             f"residuals are {np.sqrt(scale):.1f} times what the stated noise explains; the covariance is widened"
@@ -524,6 +530,8 @@ def _dropped(search: _Search, best: _Solution) -> tuple[Dropped, ...]:
             reason = "its corners are listed from the other end"
         elif together.sum() > 1 and not best.used[together].any():
             reason = "all captures of its arrival are off: the active arm stood elsewhere than it was read"
+        elif np.isinf(sigmas):
+            reason = f"its board should be behind the camera, by where the other {every.knowns.words.captures} put it"
         else:
             reason = f"{sigmas:.0f} sigma (rms) from where the other {every.knowns.words.captures} put it"
         named.append(Dropped(int(k), reason, sigmas))

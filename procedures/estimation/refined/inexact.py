@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from dualcal_hal.kinematics import Chain, Row
-from dualcal_hal.transforms import Array
+from dualcal_hal.transforms import Array, Mask
 from procedures.estimation.degenerate import Degenerate
 from procedures.estimation.refined.data import CaptureArrays, Knowns, Noise
 from procedures.estimation.refined.fit import Fit, minimise
@@ -192,40 +192,47 @@ class WithInexact:
 def fit_inexact(
     data: CaptureArrays, knowns: Knowns, noise: Noise, start: State, inexact: Sequence[Inexact], estimated: bool
 ) -> WithInexact:
-    """From a fit to captures that belong, with their corners in order. estimated: False leaves the knowns as they are
-    and adds what they may be off by to the covariance. Raises Degenerate for a freed number that cannot be seen.
+    """From a fit to captures that belong, with their corners in order. estimated: False leaves knowns with a sigma as
+    they are and adds what they may be off by to the covariance. Raises Degenerate for a freed number that cannot be
+    seen.
     """
     sigmas = np.concatenate([one.sigmas for one in inexact])
-    if not estimated and not np.all(np.isfinite(sigmas)):
-        raise ValueError("what is free has to be estimated")
-    precision = np.where(np.isfinite(sigmas), 1 / sigmas**2, 0.0)
+    free = ~np.isfinite(sigmas)
+    sought = free | estimated
+    precision = np.where(free, 0.0, 1 / sigmas**2)
     theta = np.zeros(len(sigmas))
     model = Model(data, knowns, noise)
     fit = minimise(model, start)
     for _ in range(_MOST_ROUNDS):
         cross, own, gradient = information(data, knowns, noise, inexact, theta, model, fit)
         left = own - cross.T @ np.linalg.solve(fit.at.normal, cross) + np.diag(precision)
-        covariance = _inverted(left, np.sqrt(np.diag(own) + precision), inexact)
-        if not estimated:
+        size = np.sqrt(np.diag(own) + precision)
+        posterior = np.sqrt(np.diag(_inverted(left, size, inexact, np.ones_like(sought))))
+        if not sought.any():
+            covariance = np.zeros_like(left)
             break
+        covariance = _inverted(left, size, inexact, sought)
         step = -covariance @ (gradient + precision * theta)
         theta = theta + step
         model = Model(data, _shifted(knowns, inexact, theta), noise)
         fit = minimise(model, fit.state)
-        if np.all(np.abs(step) < _CONVERGED * np.sqrt(np.diag(covariance))):
+        if np.all(np.abs(step) < _CONVERGED * posterior):
             break
+    # What is only reckoned with draws along what is sought.
+    through_sought = np.diag(np.where(sought, 0.0, 1.0))
+    through_sought -= covariance @ left @ through_sought
+    spread = covariance + through_sought @ np.diag(np.where(sought, 0.0, sigmas) ** 2) @ through_sought.T
     follow = np.linalg.solve(fit.at.normal, cross)  # by how much the cell follows a change of the knowns, reversed
-    spread = covariance if estimated else np.diag(sigmas**2)
     of_cell = np.linalg.inv(fit.at.normal) + follow @ spread @ follow.T
     together = -follow @ spread
-    # A prior's part in the estimate: how its own error comes through.
-    through = follow @ covariance @ np.diag(precision) if estimated else follow
+    # How the error of each sigma's number comes through: of a prior, and of what is only reckoned with.
+    through = follow @ (covariance @ np.diag(precision) + through_sought)
     return WithInexact(
         fit=fit,
         model=model,
         knowns=model.knowns,
         covariance=np.block([[of_cell, together], [together.T, spread]]),
-        known=tuple(_known(inexact, theta, sigmas, np.sqrt(np.diag(covariance)), estimated)),
+        known=tuple(_known(inexact, theta, sigmas, posterior, sought)),
         contributions={
             one.what: through[:, at]
             @ np.diag(np.where(np.isfinite(one.sigmas), one.sigmas, 0.0) ** 2)
@@ -292,15 +299,20 @@ def _inner(towards: Array, normal: Array) -> Array:
     return np.asarray(np.eye(towards.shape[-1]) + np.swapaxes(towards, 1, 2) @ normal @ towards)
 
 
-def _inverted(information: Array, size: Array, inexact: Sequence[Inexact]) -> Array:
-    """size (m,): roots of the information there would be if all else were known."""
-    names = [name for one in inexact for name in one.names]
-    free = np.concatenate([~np.isfinite(one.sigmas) for one in inexact])
+def _inverted(information: Array, size: Array, inexact: Sequence[Inexact], sought: Mask) -> Array:
+    """(m, m), zero but for the numbers ``sought`` (m,), the others being known. size (m,): roots of the information
+    there would be if all else were known.
+    """
+    names = np.array([name for one in inexact for name in one.names])[sought]
+    free = np.concatenate([~np.isfinite(one.sigmas) for one in inexact])[sought]
+    inverse = np.zeros_like(information)
+    information, size = information[np.ix_(sought, sought)], size[sought]
     values, axes = np.linalg.eigh(information / np.outer(size, size))
     if values[0] < _SINGULAR and free.any():
         hidden = [names[i] for i in np.flatnonzero(free & (np.abs(axes[:, 0]) > 0.3))]
         raise Degenerate(f"cannot be seen in the captures, so cannot be free: {', '.join(hidden) or 'what was freed'}")
-    return np.asarray((axes / np.maximum(values, _SINGULAR)) @ axes.T / np.outer(size, size))
+    inverse[np.ix_(sought, sought)] = (axes / np.maximum(values, _SINGULAR)) @ axes.T / np.outer(size, size)
+    return inverse
 
 
 def _shifted(knowns: Knowns, inexact: Sequence[Inexact], theta: Array) -> Knowns:
@@ -314,9 +326,9 @@ def _slices(inexact: Sequence[Inexact]) -> list[slice]:
     return [slice(int(begin), int(end)) for begin, end in pairwise(ends)]
 
 
-def _known(inexact: Sequence[Inexact], theta: Array, prior: Array, posterior: Array, estimated: bool) -> list[Known]:
+def _known(inexact: Sequence[Inexact], theta: Array, prior: Array, posterior: Array, sought: Mask) -> list[Known]:
     names = [both for one in inexact for both in zip(one.names, one.units, strict=True)]
     return [
-        Known(*both, float(value), float(before), float(after if estimated else before), bool(after < UNSEEN * before))
-        for both, value, before, after in zip(names, theta, prior, posterior, strict=True)
+        Known(*both, float(value), float(before), float(after if found else before), bool(after < UNSEEN * before))
+        for both, value, before, after, found in zip(names, theta, prior, posterior, sought, strict=True)
     ]

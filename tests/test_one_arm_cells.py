@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -23,6 +24,7 @@ from procedures.one_arm.procedure import looks_request, ways_of
 from procedures.one_arm.rehearsal import rehearse_views
 from procedures.one_arm.views import ViewPlanner
 from procedures.planning.choice import LEAST_TURN, turned_about_two_axes
+from procedures.report.plan_picture import plan_figure
 from tests.command_line import dualcal
 from tests.one_arm_cells import BOTH, EYE_IN_HAND, EYE_TO_HAND, KINEMATIC, SMALL
 
@@ -310,6 +312,23 @@ class TestDryRun:
         plan = json.loads((tmp_path / "plan" / "plan.json").read_text())
         assert plan["provisional"]
         assert len(plan["constraints"]) == 9
+        picture = cv2.imread(str(tmp_path / "plan" / "plan.png"))
+        assert picture.shape == (900, 1600, 3)
+        assert picture.std() > 10
+
+    @pytest.mark.parametrize("cell", BOTH, ids=lambda path: path.stem)
+    def test_its_picture_has_one_arm_and_what_stands(self, cell):
+        file = load_cell(cell, SMALL).cell
+        rehearsed = rehearse_views(file)
+        figure = plan_figure(file, rehearsed.home, rehearsed.plan)
+        side = figure.axes[0]
+        carried, stands = ("camera", "target") if cell == EYE_IN_HAND else ("target", "camera")
+        labels = [line.get_label() for line in side.get_lines()]
+        assert f"'arm' with the {carried}" in labels
+        assert f"the {stands}, which stands" in labels
+        assert [text.get_text() for text in side.texts].count("floor") == 1
+        assert f"'{STAND}'" not in " ".join([*labels, side.get_xlabel(), figure.texts[0].get_text()])
+        assert "9 views" in figure.texts[0].get_text()
 
     def test_no_plan_says_what_was_refused(self):
         ended = dualcal("run", EYE_IN_HAND, "--dry-run", *sets(*SMALL, "procedure.distance_mm=[1700, 1800]"))

@@ -1,6 +1,6 @@
-"""``plan.png``: both arms at the stand-off among what stands about them, the planned axes and positions.
+"""``plan.png``: the arms where they begin, among what stands about them, the planned axes and positions.
 
-From the side and from above.
+From the side and from above. With one arm what the other would carry stands by itself.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dualcal_hal.config import CellConfig
+from dualcal_hal.config import CellConfig, RobotConfig
 from dualcal_hal.geometry import Block, Cylinder, HalfSpace, Mesh, Solid
 from dualcal_hal.session.files import write_atomically
 from dualcal_hal.transforms import Array, apply
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 SIZE_PX = (1600, 900)
 _DPI = 100
 _BEYOND = 1.08  # how far an axis is drawn, of the distance to its farthest position
+_BEHIND = 0.03  # m behind a camera where the number of its axis is
+_BESIDE = np.array([0.0, 0.02, 0.02])  # m beside a position where its number is
 _PLANE = 0.4  # m to each side of a plane's origin that is drawn, and of a base's on the floor
 _ROUND = np.linspace(0.0, 2 * np.pi, 33)
 _USES = {"calibration": (BLUE, "o"), "verification": (GREEN, "s")}
@@ -64,7 +66,7 @@ def plan_figure(cell: CellConfig, arms: Posture, plan: Plan | None) -> Figure:
         _draw_arms(axes, cell, arms, view)
         for constraint in () if plan is None else plan.constraints:
             _draw_constraint(axes, cell, constraint, view)
-        _finish(axes, f"from '{cell.passive_name}' towards '{cell.active_name}', mm", vertical)
+        _finish(axes, _along(cell), vertical)
         head(axes, title)
     _write_head(figure, cell, plan)
     return figure
@@ -77,11 +79,22 @@ def _level_directions(cell: CellConfig) -> tuple[Array, Array]:
     return along, np.cross([0.0, 0.0, 1.0], along)
 
 
+def _along(cell: CellConfig) -> str:
+    if _stands(cell.passive):
+        return f"ahead of '{cell.active_name}', mm"
+    return f"from '{cell.passive_name}' towards {'the camera' if _stands(cell.active) else repr(cell.active_name)}, mm"
+
+
+def _stands(robot: RobotConfig) -> bool:
+    """Whether there is no such arm, and what it would carry stands."""
+    return robot.chain.joints == 0
+
+
 def _draw_surroundings(axes: Axes, cell: CellConfig, view: Array) -> None:
     """Fixtures as the outlines of their convex hulls, with their names, and from the side the floor under each arm."""
     bases = {"passive_base": np.eye(4), "active_base": cell.nominal.T_P_A}
     if cell.floor is not None and view[1, 2]:
-        for T_P_base in bases.values():
+        for T_P_base in _bases_of_arms(cell):
             floor = _outline(1e3 * apply(T_P_base, _points_of(HalfSpace()) + [0.0, 0.0, cell.floor]) @ view.T)
             axes.plot(*floor.T, color=GREY, linewidth=1.5, linestyle="--")
             x, y = floor[np.argmax(floor[:, 0])]
@@ -91,6 +104,12 @@ def _draw_surroundings(axes: Axes, cell: CellConfig, view: Array) -> None:
         axes.fill(*outline.T, facecolor=GREY, edgecolor=DARK, alpha=0.35, linewidth=1.5)
         x, y = (outline.min(axis=0) + outline.max(axis=0)) / 2
         axes.text(x, y, name, fontsize=TEXT - 1, color=DARK, ha="center", va="center", parse_math=False)
+
+
+def _bases_of_arms(cell: CellConfig) -> list[Array]:
+    """(4, 4) each, in P."""
+    bases = ((cell.passive, np.eye(4)), (cell.active, cell.nominal.T_P_A))
+    return [T_P_base for robot, T_P_base in bases if not _stands(robot)]
 
 
 def _points_of(solid: Solid) -> Array:
@@ -123,14 +142,18 @@ def _draw_arms(axes: Axes, cell: CellConfig, arms: Posture, view: Array) -> None
     T_P_T = cell.passive.chain.forward(arms.passive) @ cell.passive.target_mount_transform
     active = apply(T_P_A, arm_course(cell.active.chain, arms.active))
     passive = arm_course(cell.passive.chain, arms.passive)
-    camera = np.vstack([active[-1], apply(T_P_E, field_of_view(cell))])
-    target = np.vstack([passive[-1], apply(T_P_T, cell.target.board.outline[[0, 1, 2, 3, 0]])])
-    for words, course, tool, colour in (
-        (f"'{cell.active_name}' with the camera", active, camera, ORANGE),
-        (f"'{cell.passive_name}' with the target", passive, target, DARK),
+    camera = apply(T_P_E, field_of_view(cell))
+    target = apply(T_P_T, cell.target.board.outline[[0, 1, 2, 3, 0]])
+    for robot, name, course, what, tool, colour in (
+        (cell.active, cell.active_name, active, "camera", camera, ORANGE),
+        (cell.passive, cell.passive_name, passive, "target", target, DARK),
     ):
+        if _stands(robot):
+            _line(axes, tool, view, color=colour, linewidth=2, label=f"the {what}, which stands")
+            continue
+        words = f"'{name}' with the {what}"
         _line(axes, course, view, color=colour, linewidth=6, alpha=0.85, solid_joinstyle="round", label=words)
-        _line(axes, tool, view, color=colour, linewidth=2)
+        _line(axes, np.vstack([course[-1], tool]), view, color=colour, linewidth=2)
 
 
 def _draw_constraint(axes: Axes, cell: CellConfig, constraint: PlannedConstraint, view: Array) -> None:
@@ -145,7 +168,8 @@ def _draw_constraint(axes: Axes, cell: CellConfig, constraint: PlannedConstraint
     _line(axes, points, view, color=colour, linestyle="none", marker=marker, markersize=5, label=words)
     _line(axes, camera[None], view, color=colour, linestyle="none", marker="x", markersize=8, markeredgewidth=2)
     number = constraint.name.rpartition("/")[2].lstrip("0") or "0"
-    x, y = 1e3 * view @ (camera - 0.03 * axis)
+    # A camera that stands sees all positions from one place: there they tell one from the other.
+    x, y = 1e3 * view @ (points[0] + _BESIDE if _stands(cell.active) else camera - _BEHIND * axis)
     axes.text(x, y, number, fontsize=TEXT - 1, color=colour, weight="bold", ha="center", va="center")
 
 
@@ -163,14 +187,17 @@ def _finish(axes: Axes, horizontal: str, vertical: str) -> None:
 
 
 def _write_head(figure: Figure, cell: CellConfig, plan: Plan | None) -> None:
-    title = f"{cell.name}  |  " + ("stand-off, no provisional plan" if plan is None else _title(plan))
+    title = f"{cell.name}  |  " + (_title(cell, plan))
     figure.text(0.02, 0.955, title, fontsize=18, weight="bold", color=DARK, va="center", parse_math=False)
 
 
-def _title(plan: Plan) -> str:
+def _title(cell: CellConfig, plan: Plan | None) -> str:
+    of_one_arm = _stands(cell.active) or _stands(cell.passive)
+    if plan is None:
+        return f"{'home' if of_one_arm else 'stand-off'}, no provisional plan"
     parts: Sequence[str] = [
         "provisional plan" if plan.provisional else "plan",
-        f"{len(plan.constraints)} constraints",
+        f"{len(plan.constraints)} {'views' if of_one_arm else 'constraints'}",
         f"about {plan.seconds:.0f} s",
     ]
     spread = [] if plan.axis_spread is None else [f"axes spread {plan.axis_spread:.3f}"]

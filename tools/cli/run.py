@@ -37,7 +37,7 @@ from procedures.engine import Confirmation, Engine
 from procedures.observers import Observer, Observers
 from procedures.one_arm.procedure import OneArmCalibration
 from procedures.one_arm.rehearsal import rehearse_views
-from procedures.planning.model import CellModel
+from procedures.planning.model import CellModel, Posture
 from procedures.planning.plan import PLAN_FORMAT, Plan
 from procedures.rehearsal import rehearse, require_reach
 from procedures.report import draw_one_arm, draw_plan, draw_summary
@@ -300,26 +300,31 @@ def _rehearse(console: Console, file: CellFile, model: CellModel, options: RunOp
     rehearsal = rehearse(file.cell, model)
     show_rehearsal(console, file.cell, rehearsal, as_json=options.json)
     if options.out is None:
-        console.print("With --out FOLDER the plan and a picture of it are written there.")
+        console.print(_WITH_OUT)
         return
-    session = Session.create(options.out, file.text)
-    if rehearsal.plan is not None:
-        session.write_document(PLAN_FILE, rehearsal.plan.to_record())
-    draw_plan(session.folder / "plan.png", file.cell, rehearsal.arms, rehearsal.plan)
-    console.print(f"plan and picture: {session.folder}", soft_wrap=True, highlight=False)
+    _keep_rehearsed(console, file, options.out, rehearsal.arms, rehearsal.plan)
 
 
 def _rehearse_views(console: Console, file: CellFile, cell: OneArmCell, options: RunOptions) -> None:
-    """The same of a cell with one arm; its plan can be kept."""
+    """The same of a cell with one arm."""
     rehearsed = rehearse_views(cell)
     show_rehearsed_views(console, cell, rehearsed, as_json=options.json)
     if options.out is None:
-        console.print("With --out FOLDER the plan is written there.")
+        console.print(_WITH_OUT)
         return
-    session = Session.create(options.out, file.text)
-    if rehearsed.plan is not None:
-        session.write_document(PLAN_FILE, rehearsed.plan.to_record())
-    console.print(f"plan: {session.folder}", soft_wrap=True, highlight=False)
+    _keep_rehearsed(console, file, options.out, rehearsed.home, rehearsed.plan)
+
+
+_WITH_OUT = "With --out FOLDER the plan and a picture of it are written there."
+
+
+def _keep_rehearsed(console: Console, file: CellFile, folder: Path, arms: Posture, plan: Plan | None) -> None:
+    """The plan, if there is one, and its picture with the arms where they begin."""
+    session = Session.create(folder, file.text)
+    if plan is not None:
+        session.write_document(PLAN_FILE, plan.to_record())
+    draw_plan(session.folder / "plan.png", file.cell, arms, plan)
+    say_line(console, f"plan and picture: {session.folder}")
 
 
 def load_asked(options: RunOptions, path: Path) -> CellFile:

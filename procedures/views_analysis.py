@@ -106,15 +106,26 @@ def look_at(file: ViewsFile) -> Seen:
         raise FormatError(problems)
     height, width = images[0].shape
     size = (width, height) if file.intrinsics.size == (0, 0) else file.intrinsics.size
-    for view, image in zip(file.views, images, strict=True):
-        if image.shape != size[::-1]:
-            of = "the camera's size_px is" if file.intrinsics.size == size else "the first one has"
-            said = f"has {image.shape[1]} x {image.shape[0]} px, {of} {size[0]} x {size[1]}"
-            problems.append(Problem(str(view.image), said))
-    if problems:
+    if problems := list(_other_sizes(file, images, size)):
         raise FormatError(problems)
     detector = Detector(file.board, size)
     return Seen(tuple(images), tuple(detector.detect(image) for image in images), size)
+
+
+def _other_sizes(file: ViewsFile, images: Sequence[Image], size: tuple[int, int]) -> Iterator[Problem]:
+    """Told once where it is the camera's that is another, as all images have one."""
+    shapes = {image.shape for image in images}
+    if len(shapes) == 1 and size[::-1] not in shapes:
+        height, width = images[0].shape
+        yield Problem(
+            str(file.path), f"camera.size_px: is {size[0]} x {size[1]}, all images have {width} x {height} px"
+        )
+        return
+    of = "the camera's size_px is" if file.intrinsics.size == size else "the first one has"
+    for view, image in zip(file.views, images, strict=True):
+        if image.shape != size[::-1]:
+            said = f"has {image.shape[1]} x {image.shape[0]} px, {of} {size[0]} x {size[1]}"
+            yield Problem(str(view.image), said)
 
 
 def _read_image(view: View) -> Image:

@@ -350,6 +350,12 @@ class TestFile:
         assert result.exit_code == 2
         assert "has 64 x 48 px, the camera's size_px is 640 x 480" in " ".join(result.stderr.split())
 
+    def test_a_camera_of_another_size_than_all_images_is_told_once(self, changed: Callable[[Change], Path]) -> None:
+        result = dualcal("estimate", changed(lambda d: d["camera"].update(size_px=[800, 600])))
+        assert result.exit_code == 2
+        assert "camera.size_px: is 800 x 600, all images have 640 x 480 px" in " ".join(result.stderr.split())
+        assert result.stderr.count("640 x 480") == 1
+
     def test_what_is_no_image_is_refused(self, changed: Callable[[Change], Path], tmp_path: Path) -> None:
         (tmp_path / "text.png").write_text("no image")
         result = dualcal("estimate", changed(lambda d: d["views"][1].update(image="text.png")))

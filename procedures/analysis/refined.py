@@ -108,7 +108,7 @@ def _estimate(
             keep_all=choices.keep_all,
             estimate_noise=choices.find_noise,
             inexact=inexact,
-            estimate_inexact=cell.procedure.knowns == "estimate" or bool(choices.free),
+            estimate_inexact=cell.procedure.knowns == "estimate",
         )
     except Degenerate as error:
         raise DegenerateCaptures(f"the captures do not determine the transforms: {error}") from error
@@ -168,7 +168,7 @@ def _said(seen: Verification) -> str:
         for what, part in (("boards", seen.poses), ("corners on their boards", seen.corners))
         if part is not None and part.degrees_of_freedom
     ]
-    both = f"; of either (twice the smaller) {_chance(seen.probability)}" if len(parts) > 1 else ""
+    both = f"; of either part (twice the smaller) {_chance(seen.probability)}" if len(parts) > 1 else ""
     return f"{'; '.join(parts)}{both}"
 
 

@@ -11,7 +11,7 @@ from dualcal_hal.kinematics import Chain
 from dualcal_hal.transforms import Array, apply, inverse, rotation_from_vector, transform
 from procedures.estimation.projection import project
 from procedures.estimation.refined.arms import Arm
-from procedures.estimation.refined.data import CaptureArrays
+from procedures.estimation.refined.data import CaptureArrays, Indices
 from procedures.estimation.refined.estimate import Refined
 from procedures.estimation.refined.fit import Fit
 from procedures.estimation.refined.inexact import information
@@ -37,7 +37,7 @@ def would_help(result: Refined, captures: CaptureArrays) -> tuple[str, ...]:
     if not hidden:
         return ()
     known = _Known.of(result)
-    left = {words: known.with_captures(*gain).sigmas() for words, gain in _gains(result, captures)}
+    left = {words: known.with_captures(gain).sigmas() for words, gain in _gains(result, captures)}
     left |= {f"measure the {what} better": known.measured(numbers).sigmas() for what, numbers in _measurable(result)}
     now = known.sigmas()
     good = {i: _good({words: float(sigmas[i] / now[i]) for words, sigmas in left.items()}) for i in hidden}
@@ -65,10 +65,10 @@ def _helped(words: str, good: Iterable[Mapping[str, float]]) -> tuple[int, float
 
 
 def _measurable(result: Refined) -> Iterator[tuple[str, Array]]:
-    """Each inexact known, and by how much more exactly its numbers, of all m, would be known: 1 / sigma^2."""
-    begin = 0
+    """Each inexact known, and how much more would be known of its numbers, after the cell's 12: 1 / sigma^2."""
+    begin = CELL
     for one in result.inexact:
-        precision = np.zeros(len(result.known))
+        precision = np.zeros(CELL + len(result.known))
         precision[begin : begin + len(one.sigmas)] = (_BETTER**2 - 1) / one.sigmas**2
         begin += len(one.sigmas)
         yield one.what, precision
@@ -76,45 +76,44 @@ def _measurable(result: Refined) -> Iterator[tuple[str, Array]]:
 
 @dataclass(frozen=True)
 class _Known:
-    """Information on the cell (12, 12), on it together with the m numbers by which knowns are off (12, m), and on these
-    (m, m), what was known of them before included; spread (m, m): their covariance where they are only reckoned with,
-    whatever the captures say of them, else None.
+    """sought, reckoned: which of the cell's 12 and the m numbers by which knowns are off are found, and which are only
+    reckoned with, indices. found (s, s): information on the former, what was known of them before included; both
+    (s, r): on them together with the latter; spread (r, r): the covariance of these, whatever captures say of them.
     """
 
-    cell: Array
+    sought: Indices
+    reckoned: Indices
+    found: Array
     both: Array
-    numbers: Array
-    spread: Array | None
+    spread: Array
 
     @classmethod
     def of(cls, result: Refined) -> _Known:
         joint = result.joint_covariance
         # What is only reckoned with is as uncertain after the estimate as before.
-        if not result.known or any(known.sigma != known.prior for known in result.known):
-            every: Array = np.asarray(np.linalg.inv(joint), dtype=float)
-            return cls(every[:CELL, :CELL], every[:CELL, CELL:], every[CELL:, CELL:], None)
-        spread = joint[CELL:, CELL:]
-        follow = np.linalg.solve(spread, joint[CELL:, :CELL]).T
-        cell: Array = np.asarray(np.linalg.inv(joint[:CELL, :CELL] - follow @ spread @ follow.T), dtype=float)
-        return cls(cell, -cell @ follow, np.zeros_like(spread), spread)
+        as_before = np.array([False] * CELL + [known.sigma == known.prior for known in result.known])
+        sought, reckoned = np.flatnonzero(~as_before), np.flatnonzero(as_before)
+        spread = joint[np.ix_(reckoned, reckoned)]
+        follow = np.linalg.solve(spread, joint[np.ix_(reckoned, sought)]).T
+        alone = joint[np.ix_(sought, sought)] - follow @ spread @ follow.T
+        found = np.asarray(np.linalg.inv(alone), dtype=float)
+        return cls(sought, reckoned, found, -found @ follow, spread)
 
     def sigmas(self) -> Array:
         """(12,) of the cell, m and rad."""
-        if self.spread is None:
-            every = np.block([[self.cell, self.both], [self.both.T, self.numbers]])
-            return np.asarray(np.sqrt(np.diag(np.linalg.inv(every))[:CELL]))
-        follow = np.linalg.solve(self.cell, self.both)
-        return np.asarray(np.sqrt(np.diag(np.linalg.inv(self.cell) + follow @ self.spread @ follow.T)))
+        follow = np.linalg.solve(self.found, self.both)
+        covariance = np.linalg.inv(self.found) + follow @ self.spread @ follow.T
+        return np.asarray(np.sqrt(np.diag(covariance)[:CELL]))
 
-    def with_captures(self, cell: Array, both: Array, numbers: Array) -> _Known:
-        """With information of captures added."""
-        return replace(self, cell=self.cell + cell, both=self.both + both, numbers=self.numbers + numbers)
+    def with_captures(self, gain: Array) -> _Known:
+        """With information (12 + m, 12 + m) of captures on cell and knowns added."""
+        found = self.found + gain[np.ix_(self.sought, self.sought)]
+        return replace(self, found=found, both=self.both + gain[np.ix_(self.sought, self.reckoned)])
 
     def measured(self, precision: Array) -> _Known:
-        """With 1 / sigma^2 (m,) more known of the numbers, by other means than captures."""
-        if self.spread is None:
-            return replace(self, numbers=self.numbers + np.diag(precision))
-        return replace(self, spread=np.linalg.inv(np.linalg.inv(self.spread) + np.diag(precision)))
+        """With 1 / sigma^2 (12 + m,) more known, by other means than captures."""
+        spread = np.linalg.inv(np.linalg.inv(self.spread) + np.diag(precision[self.reckoned]))
+        return replace(self, found=self.found + np.diag(precision[self.sought]), spread=spread)
 
 
 @dataclass(frozen=True)
@@ -180,25 +179,24 @@ def _reaching(arm: Arm, q: Array, flange: Array) -> Array:
     return np.where(reached[:, None], found, q)
 
 
-def _gains(result: Refined, captures: CaptureArrays) -> Iterator[tuple[str, tuple[Array, Array, Array]]]:
-    """Information (12, 12), (12, m) and (m, m) that each kind adds; less where captures scatter more than stated."""
+def _gains(result: Refined, captures: CaptureArrays) -> Iterator[tuple[str, Array]]:
+    """Information (12 + m, 12 + m) that each kind adds; less where captures scatter more than stated."""
     taken = captures.turned(result.flipped).only(result.used)
     taken = replace(taken, arrivals=Model(taken, result.knowns, result.noise).arrival)
     before = _information(result, taken)
     for kind in _KINDS:
         after = _information(result, _together(taken, kind.again(result, taken)))
-        cell, both, numbers = ((b - a) / result.scale for a, b in zip(before, after, strict=True))
-        yield kind.words, (cell, both, numbers)
+        yield kind.words, (after - before) / result.scale
 
 
-def _information(result: Refined, captures: CaptureArrays) -> tuple[Array, Array, Array]:
-    """Of captures on the cell, on it with the numbers by which knowns are off, and on these."""
+def _information(result: Refined, captures: CaptureArrays) -> Array:
+    """(12 + m, 12 + m): of captures on the cell and on the numbers by which knowns are off."""
     model = Model(captures, result.knowns, result.noise)
     state = model.state(result.T_P_A, result.T_H_E)
     fit = Fit(state, model.linearised(state), True, 0)
     at_zero = np.zeros(len(result.known))
     both, numbers, _ = information(captures, result.knowns, result.noise, result.inexact, at_zero, model, fit)
-    return fit.at.normal, both, numbers
+    return np.block([[fit.at.normal, both], [both.T, numbers]])
 
 
 def _together(first: CaptureArrays, second: CaptureArrays) -> CaptureArrays:

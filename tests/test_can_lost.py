@@ -108,10 +108,12 @@ def report_once_it_is_back(link: ArmLink) -> ArmReport:
 def link(request: pytest.FixtureRequest, buses: DriveBuses) -> Iterator[ArmLink]:
     given = options(request.param, buses.endpoints["arms"]["left"]["channel"])
     opened = links(given, {"left": 2}, CLOCK)["left"]
-    opened.open(CLOCK.now() + PATIENCE)
-    opened.enable(PATIENCE)
-    yield opened
-    opened.close()
+    try:
+        opened.open(CLOCK.now() + PATIENCE)
+        opened.enable(PATIENCE)
+        yield opened
+    finally:
+        opened.close()
 
 
 def course(start: ArmReport) -> Course:

@@ -29,9 +29,9 @@ STRETCHED = (0.0, -0.8, 1.57, 0.0, 0.0, 0.0)
 
 
 class Rig:
-    """Both arms of the paper's cell behind stub links and a guard that watches."""
+    """Both arms of the paper's cell behind stub links and a guard that watches: slow, so that what happens is in time."""
 
-    def __init__(self, pace=FULL_PACE, own_speed=None):
+    def __init__(self, pace=Pace(largest=REDUCED_SPEED), own_speed=None):  # noqa: B008 - it is frozen
         clock = RealClock()
         self.links, self.arms, self._robots = {}, {}, []
         for name, config in CONFIG.robots.items():
@@ -60,6 +60,12 @@ class Rig:
             robot.detach()
         for link in self.links.values():
             link.close()
+
+
+@pytest.fixture(autouse=True)
+def _feedback_may_be_older(monkeypatch):
+    """Stub links report from threads of a machine that may have much else to do."""
+    monkeypatch.setattr("dualcal_hal.watch.OWN_WORD_FIRST", 0.4)
 
 
 @pytest.fixture

@@ -25,13 +25,15 @@ GEOMETRY = CellGeometry.of(CONFIG)
 HOME = tuple(map(float, CONFIG.active.home))
 ASIDE = (1.0, *HOME[1:])
 AMPLE = 30.0
+SLOW = Pace(largest=REDUCED_SPEED)
+"""So that what happens within a motion does, whatever the machine has to do besides."""
 STRETCHED = (0.0, -0.8, 1.57, 0.0, 0.0, 0.0)
 
 
 class Rig:
-    """Both arms of the paper's cell behind stub links and a guard that watches: slow, so that what happens is in time."""
+    """Both arms of the paper's cell behind stub links and a guard that watches."""
 
-    def __init__(self, pace=Pace(largest=REDUCED_SPEED), own_speed=None):  # noqa: B008 - it is frozen
+    def __init__(self, pace=SLOW, own_speed=None):
         clock = RealClock()
         self.links, self.arms, self._robots = {}, {}, []
         for name, config in CONFIG.robots.items():
@@ -82,7 +84,7 @@ def rig():
 
 
 def test_a_motion_with_nothing_wrong_settles(rig):
-    cell = rig(pace=Pace(largest=REDUCED_SPEED))
+    cell = rig(pace=SLOW)
     motion = cell.start("left", ASIDE)
     np.testing.assert_allclose(motion.wait(AMPLE).positions, ASIDE, atol=1e-6)
     assert motion.state is MotionState.SETTLED
@@ -163,7 +165,7 @@ def test_an_arm_off_its_path_is_stopped(rig, monkeypatch):
 
 
 def test_an_arm_that_is_faster_than_it_may_be_is_stopped_and_the_other_too(rig, monkeypatch):
-    cell = rig(pace=Pace(largest=REDUCED_SPEED))
+    cell = rig(pace=SLOW)
     motion = cell.start("left", ASIDE)
     course = cell.links["left"].courses[0]
     planned = course.sample
@@ -256,11 +258,11 @@ def test_an_arm_that_cannot_be_looked_at_is_stopped(rig, monkeypatch):
 
 def test_a_controller_with_a_speed_of_its_own_moves_under_a_limit_only_once_that_is_confirmed(rig):
     for own, words in ((OwnSpeed(None), "nobody has confirmed"), (OwnSpeed(0.3), "300 mm/s are confirmed")):
-        cell = rig(pace=Pace(largest=REDUCED_SPEED), own_speed=own)
+        cell = rig(pace=SLOW, own_speed=own)
         with pytest.raises(CommandRefused, match=f"250 mm/s are allowed, and .*{words}"):
             cell.start("left", ASIDE)
         assert not cell.links["left"].courses
-    rig(pace=Pace(largest=REDUCED_SPEED), own_speed=OwnSpeed(0.25)).start("left", ASIDE).wait(AMPLE)
+    rig(pace=SLOW, own_speed=OwnSpeed(0.25)).start("left", ASIDE).wait(AMPLE)
 
 
 def test_a_share_of_the_speed_is_a_limit_too(rig):
@@ -269,7 +271,7 @@ def test_a_share_of_the_speed_is_a_limit_too(rig):
 
 
 def test_a_path_beyond_the_pace_is_refused_before_anything_is_sent(rig):
-    cell = rig(pace=Pace(largest=REDUCED_SPEED))
+    cell = rig(pace=SLOW)
     arm = cell.arms["left"]
     path = FULL_PACE.path(HOME, (ASIDE,), arm.limits, GEOMETRY.active)
     with pytest.raises(CommandRefused, match=r"a part would move at .* 250 mm/s are allowed"):

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from dualcal_hal.session.views_result import Residue, ViewsResult
+from procedures.figures import two_digits
 
 FAR_ABOVE = 3.0
 """Times the corners' own noise, from where residuals are told to be far above it."""
@@ -32,7 +33,9 @@ def verdict_of(result: ViewsResult, scale: float) -> tuple[str, tuple[str, ...]]
     """
     corners, told = corner_noise(result.residue)
     far = result.rms > FAR_ABOVE * corners
-    position = f"{1e3 * result.camera_error.rms:.2g} mm (rms), {1e3 * result.camera_error.p95:.2g} mm (95 %)"
+    position = (
+        f"{two_digits(1e3 * result.camera_error.rms)} mm (rms), {two_digits(1e3 * result.camera_error.p95)} mm (95 %)"
+    )
     name = next(iter(result.transforms))
     reasons = []
     if scale > 1:
@@ -44,14 +47,16 @@ def verdict_of(result: ViewsResult, scale: float) -> tuple[str, tuple[str, ...]]
         source = "scatter" if told else "usually scatter"
         reasons.append(
             f"corners are off by {result.rms:.2f} px rms per axis, {result.rms / corners:.0f} times the"
-            f" {corners:.2g} px that they themselves {source}: what is off is something else"
+            f" {two_digits(corners)} px that they themselves {source}: what is off is something else"
         )
         reasons.append(f"for {name} that means: the camera's position is uncertain by {position}")
         if result.moved_by_lens is not None:
-            reasons.append(f"it moves by {1e3 * result.moved_by_lens:.2g} mm as the intrinsics are left to the images")
+            reasons.append(
+                f"it moves by {two_digits(1e3 * result.moved_by_lens)} mm as the intrinsics are left to the images"
+            )
         reasons += _look_at(result.residue, corners, freed=bool(result.intrinsics_sigmas))
     else:
-        reasons.append(f"corners are off by {result.rms:.2g} px rms per axis, hardly more than their own noise")
+        reasons.append(f"corners are off by {two_digits(result.rms)} px rms per axis, hardly more than their own noise")
         reasons.append(f"{name}: the camera's position is uncertain by {position}")
     coarse = far or result.camera_error.p95 > COARSE
     return "fail" if scale > 1 else "coarse" if coarse else "ok", tuple(reasons)
@@ -70,8 +75,8 @@ def _look_at(residue: Residue, corners: float, *, freed: bool) -> Iterator[str]:
             continue
         said = f"look at {_LOOK_AT[what]}: {share:.2f} px go when {_LEFT[what]}"
         if what == "board" and residue.off_places is not None:
-            across, out = (1e3 * off for off in residue.off_places)
-            said += f"; corners then lie {across:.2g} mm (rms) beside their places and {out:.2g} mm out of the plane"
+            across, out = (two_digits(1e3 * off) for off in residue.off_places)
+            said += f"; corners then lie {across} mm (rms) beside their places and {out} mm out of the plane"
         if what == "lens":
             said += "; calibrate the camera, or try --free intrinsics"
         yield said

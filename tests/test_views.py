@@ -412,6 +412,16 @@ class TestPhotographs:
         assert 0.005 < moved < 0.012
         assert 1e3 * moved < given["predicted_error"]["camera_position_mm"]["p95"]
 
+    def test_squares_in_metres_are_refused_in_words(self, tmp_path: Path) -> None:
+        document = json.loads(ABB.read_text())
+        document["target"].update(square_mm=0.036195, marker_mm=0.018256)
+        for view in document["views"]:
+            view["image"] = str(ABB.parent / view["image"])
+        (tmp_path / "views.json").write_text(json.dumps(document))
+        result = dualcal("estimate", tmp_path / "views.json")
+        assert result.exit_code == 2
+        assert "see that lengths are in the units that keys name" in " ".join(result.stderr.split())
+
     @pytest.mark.slow
     def test_it_needs_no_guess(self, given: dict[str, Any], tmp_path: Path) -> None:
         document = json.loads(ABB.read_text())

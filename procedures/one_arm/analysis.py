@@ -37,6 +37,7 @@ from procedures.estimation.refined.left_out import LeftOut, leave_one_out, predi
 from procedures.estimation.refined.one_arm import OneArm, as_captures, described
 from procedures.estimation.refined.one_arm_hidden import hidden_of_one_arm
 from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, in_order, verify
+from procedures.figures import two_digits
 from procedures.one_arm.fit import estimate, inexact_of, joint_sigma, placement_of, views_of_captures
 from procedures.one_arm.sorting import Sorted, joints_of, sort_out
 
@@ -210,7 +211,7 @@ def _judge(
     where something moved, what holds for the rest of the views need not hold for what comes after.
     """
     reached, required = accuracy.at_target.p95_mm, accuracy.required_mm
-    error = f"predicted 3D error of at most {reached:.2g} mm (95 %) where the camera saw the target"
+    error = f"predicted 3D error of at most {two_digits(reached)} mm (95 %) where the camera saw the target"
     by_others = f"each view predicted by the others: {_said(left_out)}"
     misfit = _misfit(fit)
     if proof is None:
@@ -241,7 +242,7 @@ def _misfit(fit: OneArmFitRecord) -> tuple[str, ...]:
 def _said(off: OffRecord | None) -> str:
     if off is None:
         return "the target should be behind the camera"
-    return f"{off.rms_px:.2g} px, {off.rms_mm:.2g} mm at the target"
+    return f"{two_digits(off.rms_px)} px, {two_digits(off.rms_mm)} mm at the target"
 
 
 def _chance(proof: OneArmVerificationRecord) -> str:

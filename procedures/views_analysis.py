@@ -144,6 +144,12 @@ def _read_image(view: View) -> Image:
 
 def analyse_views(file: ViewsFile, seen: Seen, choices: ViewsChoices) -> ViewsResult:
     """Estimate from what was found in the images; DegenerateCaptures for views that do not determine the transforms."""
+    if not seen.with_target:
+        raise DegenerateCaptures(
+            f"{file.path}: the target is in none of {len(seen.images)} images"
+            f" ({file.views[0].name}: {seen.outcomes[0]});"
+            " see that target.kind, squares and dictionary are those of the board"
+        )
     views = _views(file, seen)
     try:
         placement, views, rough = _placed(file, views)

@@ -362,6 +362,13 @@ class TestFile:
         assert result.exit_code == 2
         assert "is no image that can be read" in " ".join(result.stderr.split())
 
+    def test_a_board_of_another_dictionary_is_in_no_image(self, changed: Callable[[Change], Path]) -> None:
+        result = dualcal("estimate", changed(lambda d: d["target"].update(dictionary="DICT_7X7_50")))
+        assert result.exit_code == 2
+        said = " ".join(result.stderr.split())
+        assert "the target is in none of 8 images (" in said
+        assert "see that target.kind, squares and dictionary are those of the board" in said
+
     def test_views_that_do_not_tell_are_refused_with_the_reason(self, changed: Callable[[Change], Path]) -> None:
         result = dualcal("estimate", changed(lambda d: d.update(views=d["views"][:2])))
         assert result.exit_code == 2

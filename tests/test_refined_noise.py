@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from procedures.estimation.refined import Noise, refined
+from procedures.estimation.refined.fit import minimise
+from procedures.estimation.refined.model import Model
 from tools.benchmarks.refined import NOISES, noises_found, reference
 
 STATED = Noise(0.05, 3e-5, 3e-5)
@@ -68,3 +72,15 @@ def test_the_covariance_holds_where_the_noise_was_stated_three_or_four_times_too
         assert found.scale > 1
         assert found.used.all()
     assert np.mean(squares) == pytest.approx(12, abs=7)
+
+
+def test_the_covariance_is_widened_where_arrivals_differ_by_more_than_the_noise_that_was_found() -> None:
+    """The active arm misses its readings by far more than the passive one, and is stated to be as good."""
+    cell, noise = reference(), NOISES[0]
+    data = cell.noisy(np.random.default_rng(0), replace(noise, active=8 * noise.active))
+    found = refined(data, cell.knowns, noise, estimate_noise=True)
+    assert found.scale > 2
+    assert any("the covariance is widened" in words for words in found.warnings)
+    model = Model(found.captures, cell.knowns, found.noise)
+    plain = np.linalg.inv(minimise(model, model.state(found.T_P_A, found.T_H_E)).at.normal)
+    assert np.sqrt(np.trace(found.covariance) / np.trace(plain)) == pytest.approx(np.sqrt(found.scale), rel=0.2)

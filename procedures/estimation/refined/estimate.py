@@ -52,6 +52,8 @@ _STANDS_OUT = 4.0  # a square
 # What share may be left out: where all may be off together, and where those that stand out explain all.
 _FEW, _LESS_THAN_HALF = 1 / 3, 0.49
 
+_MISFIT = 900.0  # squares larger by more than this are not of arms, mounts or cameras that are somewhat off
+
 _NOISE_ROUNDS = 2  # what is found for the noise moves the estimate, which hardly moves what is found
 _SIGNIFICANT = 1e-3
 _LARGE = 0.005  # m; a predicted sigma above it is warned of
@@ -232,7 +234,7 @@ def _estimate(
             search = replace(search, farther=_STANDS_OUT)
             solutions = _best_first(search.solutions(plain, False) + search.solutions(thorough, True))
             if solutions and not search.explained(solutions[0], _LESS_THAN_HALF):
-                solutions = [one for one in solutions if search.share_out(one) <= _FEW] or solutions
+                solutions = [one for one in solutions if search.off_alike(one)] or solutions
     if not solutions:
         raise Degenerate(
             f"nothing explains the {knowns.words.captures}, even roughly:"
@@ -276,6 +278,10 @@ class _Search:
         """Whether outliers explain all that is off: the others fit the noise, and are enough to be believed."""
         out = self.share_out(solution)
         return out == 0 or (out <= most_out and _scale(solution) == 1)
+
+    def off_alike(self, solution: _Solution) -> bool:
+        """Whether it may be one misfit that all captures share, but for a few."""
+        return self.share_out(solution) <= _FEW and _scale(solution) <= _MISFIT
 
     def solutions(self, found: Sequence[Start], only_fitting: bool) -> list[_Solution]:
         """From all starts, best first; only_fitting: at first with the captures that fit the start."""
@@ -449,18 +455,27 @@ def _result(
 
 
 def _widened(search: _Search, best: _Solution, contributions: dict[str, Array], scale: float) -> dict[str, Array]:
-    """What each source contributes when it is as large as the captures show it, if that is larger than stated."""
-    stated, state = search.every.noise, best.fit.state
+    """What each source contributes when it is as large as the captures show it, if that is larger than stated; and all
+    of them by as much more as the arrivals still differ from one cell under such noise: what is wrong with knowns and
+    arms shows there, and is no noise.
+    """
+    stated, state, knowns = search.every.noise, best.fit.state, search.every.knowns
     kept = search.data.turned(best.flipped).only(best.used)
-    found = find_noise(kept, search.every.knowns, stated, state.T_P_A, state.T_H_E).noise
+    found = find_noise(kept, knowns, stated, state.T_P_A, state.T_H_E).noise
     if min(stated.active, stated.passive) == 0:
         return {what: scale * part for what, part in contributions.items()}
     ratios = {
-        "pixels": found.pixel / stated.pixel,
-        "active joints": found.active / stated.active,
-        "passive joints": found.passive / stated.passive,
+        "pixels": max(1.0, found.pixel / stated.pixel),
+        "active joints": max(1.0, found.active / stated.active),
+        "passive joints": max(1.0, found.passive / stated.passive),
     }
-    return {what: max(1.0, ratios[what]) ** 2 * part for what, part in contributions.items()}
+    shown = Noise(
+        ratios["pixels"] * stated.pixel,
+        ratios["active joints"] * stated.active,
+        ratios["passive joints"] * stated.passive,
+    )
+    left = _excess(*between_arrivals(minimise(Model(kept, knowns, shown), state)))
+    return {what: left * ratios[what] ** 2 * part for what, part in contributions.items()}
 
 
 def _scale(solution: _Solution) -> float:

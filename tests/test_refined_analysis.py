@@ -134,9 +134,19 @@ class TestVerdict:
                 assert numbers["degrees_of_freedom"] == freedom
                 chances.append(stats.chi2.sf(numbers["chi_square"], freedom))
                 assert numbers["probability"] == pytest.approx(chances[-1])
-                told = f"{words} chi-square {numbers['chi_square']:.4g} of {freedom}, probability "
+                told = f"{words} chi-square {numbers['chi_square']:.1f} of {freedom}, probability "
                 assert any(told in reason for reason in found.reasons)
             assert seen["probability"] == pytest.approx(min(1.0, 2 * min(chances)))
+
+    def test_what_one_cell_explains_together_with_the_calibration_is_coarse_and_no_failure(self) -> None:
+        """Captures that scatter a little less than stated, and others that scatter a little more."""
+        rough = {c.id: c for c in noisy(4, size=1.35).captures}
+        found = analyse(changed(noisy(4, size=0.6), "verification", lambda c: rough[c.id]), cell(), "refined")
+        assert found.verification is not None
+        assert found.verification.probability < LEAST_PROBABILITY
+        assert found.verdict == "coarse"
+        assert "farther from where they are predicted than chance explains" in found.reasons[0]
+        assert "all captures together fit one cell, so calibrate with more" in found.reasons[1]
 
     def test_files_of_before_both_parts_were_told_apart_are_read(self, result: Result, tmp_path: Path) -> None:
         write_result(tmp_path / "result.json", result)

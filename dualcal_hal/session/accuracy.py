@@ -221,7 +221,7 @@ class Verification(Record):
     """That either part is as large or larger by chance: twice the smaller of both probabilities (Bonferroni), at most
     1; that of the one part where the other has no degrees of freedom."""
     least_probability: Finite
-    """Below it the result fails."""
+    """Below it the result fails, or is coarse where one cell fits these captures with those of the calibration."""
     arrivals: int | None = None
     """Of the active arm, at which the captures were taken."""
     captures: tuple[VerifiedCaptureRecord, ...]

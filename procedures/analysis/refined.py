@@ -20,7 +20,7 @@ from procedures.analysis.verification import CalibratedPlaces, joints, mismatch_
 from procedures.estimation import Degenerate, Statistics, mismatch, statistics
 from procedures.estimation.projection import undistort
 from procedures.estimation.refined import Inexact, Refined, refined
-from procedures.estimation.refined.suspects import Suspect, next_suspects
+from procedures.estimation.refined.suspects import TOGETHER, Suspect, next_suspects
 from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, Part, verify
 
 FREE = ("target_mount", "intrinsics")
@@ -28,6 +28,7 @@ FREE = ("target_mount", "intrinsics")
 
 
 _TOLD = 1e-4  # a smaller probability is told as below it
+_MANY = 1e6  # squares, of which the number no longer counts
 _FEWEST_CAPTURES, _FEWEST_ARRIVALS = 3, 2  # to verify with; the captures of one arrival share its error
 
 
@@ -149,14 +150,20 @@ def _judge(seen: Verification | None, accuracy: Accuracy) -> tuple[Verdict, tupl
     predicted = f"predicted 3D error of at most {space.p95_mm:.2g} mm (95 %) in the region"
     if seen is None:
         return "unverified", ("no verification captures: nothing shows that the noise is as stated", predicted)
-    said = (_said(seen), *_few(seen))
+    said = _said(seen)
+    if seen.look_at == (TOGETHER.words,):
+        off = f"the verification captures are farther from where they are predicted than chance explains: {said}"
+        return "coarse", (off, f"look next at {TOGETHER.words}", predicted)
     if seen.probability < seen.least_probability:
         return "fail", (
-            f"the verification captures are not where they are predicted, for the stated noise: {said[0]}",
-            *said[1:],
+            f"the verification captures are not where they are predicted, for the stated noise: {said}",
             *(f"look next at {words}" for words in seen.look_at[:1]),
         )
-    reasons = (f"the verification captures are where they are predicted: {said[0]}", *said[1:], *_doubts(accuracy))
+    reasons = (
+        f"the verification captures are where they are predicted: {said}",
+        *_few(seen),
+        *_doubts(accuracy),
+    )
     if space.p95_mm > space.required_mm:
         return "coarse", (f"{predicted}, above the {space.required_mm:g} mm required", *reasons)
     return "ok", (f"{predicted}, within the {space.required_mm:g} mm required", *reasons)
@@ -164,7 +171,8 @@ def _judge(seen: Verification | None, accuracy: Accuracy) -> tuple[Verdict, tupl
 
 def _said(seen: Verification) -> str:
     parts = [
-        f"{what} chi-square {part.chi_square:.4g} of {part.degrees_of_freedom}, probability {_chance(part.probability)}"
+        f"{what} chi-square {_squares(part.chi_square)} of {part.degrees_of_freedom},"
+        f" probability {_chance(part.probability)}"
         for what, part in (("boards", seen.poses), ("corners on their boards", seen.corners))
         if part is not None and part.degrees_of_freedom
     ]
@@ -173,7 +181,7 @@ def _said(seen: Verification) -> str:
 
 
 def _few(seen: Verification) -> Iterator[str]:
-    """Where what the verification captures say is worth little, whatever it is."""
+    """Where it is worth little that the verification captures fit."""
     captures, arrivals = len(seen.captures), seen.arrivals or 0
     if captures < _FEWEST_CAPTURES or arrivals < _FEWEST_ARRIVALS:
         taken = f"{captures} verification capture{'s' * (captures > 1)} at {arrivals} arrival{'s' * (arrivals > 1)}"
@@ -187,6 +195,10 @@ def _doubts(accuracy: Accuracy) -> Iterator[str]:
         why = "knowns that are not exact may be why" if accuracy.knowns else "something is off that these do not show"
         numbers = f"chi-square {fit.chi_square:.0f} of {fit.degrees_of_freedom}"
         yield f"yet the calibration captures themselves do not fit the stated noise ({numbers}): {why}"
+
+
+def _squares(value: float) -> str:
+    return f"{value:.1f}" if value < _MANY else f"{value:.1g}"
 
 
 def _chance(probability: float) -> str:

@@ -27,7 +27,6 @@ _LINK = (0.002, float(np.radians(0.3)))  # m, rad
 
 _MOST_OF_IT = 0.5  # of what is too much
 _LOOSE = "looseness: backlash, sag, a camera or target that is not tight"
-_TOGETHER = "the estimate: all captures together fit one cell, so calibrate with more of them"
 _FEWEST_ARRIVALS = 3
 
 
@@ -40,6 +39,10 @@ class Suspect:
     words: str
     share: float
     explains: bool
+
+
+TOGETHER = Suspect("the estimate: all captures together fit one cell, so calibrate with more of them", 1.0, True)
+"""Where nothing else is to be looked at."""
 
 
 def next_suspects(result: Refined, captures: CaptureArrays, names: Sequence[str] | None = None) -> tuple[Suspect, ...]:
@@ -59,7 +62,7 @@ def next_suspects(result: Refined, captures: CaptureArrays, names: Sequence[str]
         return (Suspect(_LOOSE, 0.0, False),)
     corners = (*_pixel_sigma(result, captures, as_given), _CORNERS) if as_given.corners_off() else ()
     if as_given.explains():
-        return corners or (Suspect(_TOGETHER, 1.0, True),)
+        return corners or (TOGETHER,)
     if any(suspect.explains for suspect in corners):
         return corners
     found = [*_knowns(result, captures, as_given), *_left_out(result, captures, as_given, called)]

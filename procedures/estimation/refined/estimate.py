@@ -469,12 +469,11 @@ def _widened(search: _Search, best: _Solution, contributions: dict[str, Array], 
         "active joints": max(1.0, found.active / stated.active),
         "passive joints": max(1.0, found.passive / stated.passive),
     }
-    shown = Noise(
-        ratios["pixels"] * stated.pixel,
-        ratios["active joints"] * stated.active,
-        ratios["passive joints"] * stated.passive,
-    )
-    left = _excess(*between_arrivals(minimise(Model(kept, knowns, shown), state)))
+    active, passive = ratios["active joints"], ratios["passive joints"]
+    shown = Noise(ratios["pixels"] * stated.pixel, active * stated.active, passive * stated.passive)
+    # The arms' errors are counted in sigmas.
+    there = replace(state, active=state.active / active, passive=state.passive / passive)
+    left = _excess(*between_arrivals(minimise(Model(kept, knowns, shown), there)))
     return {what: left * ratios[what] ** 2 * part for what, part in contributions.items()}
 
 

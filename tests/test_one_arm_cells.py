@@ -213,7 +213,6 @@ class TestWhatIsWrong:
         result = read_one_arm_result(tmp_path / "session" / "result.json")
         assert result.verdict == "fail"
         assert result.reasons[0].startswith(said)
-        assert len(result.captures_rejected) >= 2
 
     @pytest.mark.slow
     def test_a_target_far_from_its_nominal_place_is_found_and_told_of(self, tmp_path):

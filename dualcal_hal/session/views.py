@@ -45,6 +45,9 @@ LARGEST_FILE = 20_000_000
 
 MOST_VIEWS = 2000
 
+SMALLEST_SQUARE_MM = 1.0
+"""A smaller one is in other units."""
+
 _MOST_PROBLEMS = 50
 
 PlacementName = Literal["eye-in-hand", "eye-to-hand"]
@@ -93,6 +96,12 @@ def _camera_matrix(matrix: Matrix3) -> Matrix3:
     return matrix
 
 
+def _side(square_mm: float) -> float:
+    if square_mm < SMALLEST_SQUARE_MM:
+        raise ValueError(f"a square of {square_mm:g} mm: its side is in millimetres")
+    return square_mm
+
+
 class _Camera(Section):
     matrix: Annotated[Matrix3, AfterValidator(_camera_matrix)]
     distortion: Annotated[tuple[Number, ...], Field(min_length=4, max_length=5)] | None = None
@@ -104,7 +113,7 @@ class _Target(Section):
     kind: Literal["charuco", "checkerboard"]
     squares_x: Annotated[Natural, Field(ge=4)]
     squares_y: Annotated[Natural, Field(ge=4)]
-    square_mm: Positive
+    square_mm: Annotated[Positive, AfterValidator(_side)]
     marker_mm: Positive | None = None
     dictionary: str | None = None
     legacy: bool = False

@@ -260,22 +260,17 @@ def refined_views(
         count = f"{enough.sum()} view{'s' if enough.sum() != 1 else ''}"
         raise Degenerate(f"{count} with at least {FEWEST_CORNERS} corners seen, at least {FEWEST_VIEWS} are needed")
     sigma = views.arm.sigma
-    try:
-        result = refined(
-            data,
-            knowns,
-            Noise(pixel_sigma, sigma, sigma),
-            further_starts=[(inverse(target), camera) for camera, target in further_starts],
-            keep_all=keep_all,
-            estimate_noise=estimate_noise,
-            inexact=inexact,
-            estimate_inexact=estimate_inexact,
-            observable=observable,
-        )
-    except np.linalg.LinAlgError as error:
-        raise Degenerate(
-            "what was seen goes with no place of camera and target: see that lengths are in the units that keys name"
-        ) from error
+    result = refined(
+        data,
+        knowns,
+        Noise(pixel_sigma, sigma, sigma),
+        further_starts=[(inverse(target), camera) for camera, target in further_starts],
+        keep_all=keep_all,
+        estimate_noise=estimate_noise,
+        inexact=inexact,
+        estimate_inexact=estimate_inexact,
+        observable=observable,
+    )
     agree, seen = int(result.used.sum()), int(np.any(views.seen, axis=1).sum())
     if 2 * agree <= seen:
         raise Degenerate(

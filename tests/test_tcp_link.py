@@ -61,8 +61,18 @@ def _soon_observed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def _late_is_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both ends share a machine here that may have much else to do; test_tcp_freshness.py has the real limit."""
+    """Both ends share a machine here that may have much else to do; test_tcp_freshness.py has the real limits."""
     monkeypatch.setattr("backends.controller.tcp.state.LATE_AT_LEAST", 0.5)
+    for limit in ("state.LOST_AFTER", "feedback.LOST_AFTER", "session._REPORT_WITHIN"):
+        monkeypatch.setattr(f"backends.controller.tcp.{limit}", PATIENCE)
+    monkeypatch.setattr("backends.controller.tcp.dialects.Dialect.acknowledges_within", PATIENCE)
+
+
+@pytest.fixture
+def given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What does not come is given up soon, where a test is about that."""
+    monkeypatch.setattr("backends.controller.tcp.state.LOST_AFTER", 1.0)
+    monkeypatch.setattr("backends.controller.tcp.dialects.Dialect.acknowledges_within", 1.0)
 
 
 def soon(seconds: float = PATIENCE) -> float:
@@ -210,6 +220,7 @@ def test_a_state_port_that_is_none_is_not_opened() -> None:
         link_to(server, "rep").open(soon())
 
 
+@pytest.mark.usefixtures("given_up")
 def test_a_state_port_that_tells_no_joints_is_not_opened() -> None:
     with (
         controller("rep", state_chunks=lambda data: iter([data[-44:]])) as server,
@@ -560,6 +571,7 @@ def unanswered(when: Callable[[Received], bool], otherwise: Answer) -> Answer:
     return answer
 
 
+@pytest.mark.usefixtures("given_up")
 def test_a_point_that_is_not_answered_fails_the_course_and_has_the_arm_stop() -> None:
     with arm("rep", unanswered(lambda m: m.id == 11 and m.integer(0) == 2, rep)) as (link, server):
         told = Told(link)
@@ -573,6 +585,7 @@ def test_a_point_that_is_not_answered_fails_the_course_and_has_the_arm_stop() ->
         _until(lambda: ended(link.send(course(0.0))).complete)
 
 
+@pytest.mark.usefixtures("given_up")
 def test_a_first_point_that_is_not_answered_is_told_to_who_sent_it() -> None:
     with arm("rep", unanswered(lambda m: m.id == 11 and m.integer(0) == 0, rep)) as (link, server):
         with pytest.raises(DeviceTimeout, match="sent no reply in time"):
@@ -580,6 +593,7 @@ def test_a_first_point_that_is_not_answered_is_told_to_who_sent_it() -> None:
         server.wait_for(lambda: server.sequences()[-1] == -4)
 
 
+@pytest.mark.usefixtures("given_up")
 def test_a_motion_port_that_answers_no_more_is_lost_and_connected_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("backends.controller.tcp.motion.PING_EVERY", 0.05)
     silent = threading.Event()
@@ -598,6 +612,7 @@ def test_a_motion_port_that_answers_no_more_is_lost_and_connected_anew(monkeypat
         assert ended(link.send(course(0.1))).complete
 
 
+@pytest.mark.usefixtures("given_up")
 def test_a_late_reply_is_not_taken_for_the_next_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("backends.controller.tcp.motion._LATE", PATIENCE)
     late, given_up = threading.Event(), threading.Event()
@@ -854,8 +869,7 @@ def test_what_a_controller_says_of_motion_is_reported(said: int) -> None:
         assert newer(link).in_motion is {0: False, 1: True, -1: None}[said]
 
 
-def test_one_course_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("backends.controller.tcp.dialects.Rep.acknowledges_within", PATIENCE)
+def test_one_course_at_a_time() -> None:
     gate = threading.Event()
 
     def answer(server: SmallServer, message: Received) -> bytes | None:
@@ -930,6 +944,7 @@ def test_closing_wakes_who_waits_for_a_report() -> None:
 # -- links that break -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("given_up")
 def test_feedback_that_stops_is_late_first_and_then_the_link_is_lost() -> None:
     with arm("rep") as (link, server):
         told = Told(link)

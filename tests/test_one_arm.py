@@ -19,11 +19,11 @@ from procedures.estimation.refined import intrinsics
 from procedures.estimation.refined.arms import Inverted, MeasuredFlange
 from procedures.estimation.refined.as_read import fit_as_read
 from procedures.estimation.refined.breakdown import break_down
+from procedures.estimation.refined.hidden import hidden_of_one_arm
 from procedures.estimation.refined.inexact import Known
 from procedures.estimation.refined.left_out import leave_one_out
 from procedures.estimation.refined.motion import in_flange, logarithm, moved
 from procedures.estimation.refined.one_arm import FlangePoses, JointReadings, OneArm, Placement, Views, one_arm
-from procedures.estimation.refined.one_arm_hidden import hidden_of_one_arm
 from tests.cells import PAPER
 
 BOARD = Checkerboard(5, 4, 0.025, 9)

@@ -266,9 +266,12 @@ class TestKnowns:
         result = analysed(file, captures, self.SIGMA)
         assert all(known.value != 0 and known.sigma < 0.5 for known in result.knowns)
 
-    def test_what_is_free_is_estimated_all_the_same(self, file, captures):
-        result = analysed(file, captures, "procedure.knowns=propagate", choices=Choices(free=("intrinsics",)))
-        assert all(known.value != 0 for known in result.knowns)
+    def test_what_is_free_is_estimated_all_the_same_and_nothing_else(self, file, captures):
+        size = "target.square_sigma_mm=0.01"
+        result = analysed(file, captures, size, "procedure.knowns=propagate", choices=Choices(free=("intrinsics",)))
+        found = {known.name: known.value != 0 for known in result.knowns}
+        assert {name for name in found if not found[name]} == {"square size"}
+        assert len(found) == 10
 
 
 def test_what_no_view_can_show_is_told_with_its_size(file, captures):

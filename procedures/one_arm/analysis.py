@@ -33,9 +33,9 @@ from procedures.analysis.board_poses import refuse_two_kinds_of_noise, refuse_wh
 from procedures.analysis.verification import words_for
 from procedures.estimation import Degenerate
 from procedures.estimation.refined import Limits, Refined
+from procedures.estimation.refined.hidden import hidden_of_one_arm
 from procedures.estimation.refined.left_out import LeftOut, leave_one_out, predicted
 from procedures.estimation.refined.one_arm import OneArm, as_captures, described
-from procedures.estimation.refined.one_arm_hidden import hidden_of_one_arm
 from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, in_order, verify
 from procedures.figures import two_digits
 from procedures.one_arm.fit import estimate, inexact_of, joint_sigma, placement_of, views_of_captures
@@ -69,7 +69,7 @@ def analyse_one_arm(captures: Captures, cell: OneArmCell, choices: Choices | Non
     if not kinds.calibration:
         raise DegenerateCaptures(_nothing_left(kinds))
     placement, inexact = placement_of(config), inexact_of(config, choices.free)
-    estimated = config.procedure.knowns == "estimate" or bool(choices.free)
+    estimated = config.procedure.knowns == "estimate"
     views = views_of_captures(cell, kinds.calibration)
     try:
         result = estimate(
@@ -81,7 +81,9 @@ def analyse_one_arm(captures: Captures, cell: OneArmCell, choices: Choices | Non
             estimate_inexact=estimated,
         )
         found = described(views, placement, result)
-        left_out = leave_one_out(views, found, inexact if estimated else ())
+        left_out = leave_one_out(
+            views, found, [one for one in inexact if estimated or not np.isfinite(one.sigmas).any()]
+        )
     except Degenerate as error:
         raise DegenerateCaptures(f"the views do not tell where camera and target are: {error}") from error
     proof = _verification(cell, result, kinds.verification) if kinds.verification else None

@@ -15,8 +15,10 @@ from procedures.estimation import Degenerate
 from procedures.estimation.refined.closed_form import solve
 from procedures.estimation.refined.data import CaptureArrays, Noise
 from procedures.estimation.refined.estimate import refined
+from procedures.estimation.refined.model import Model
 from procedures.estimation.refined.motion import moved
 from procedures.estimation.refined.resection import plane_poses, resect
+from procedures.estimation.refined.start import camera_candidates
 from tools.benchmarks.refined import LIMITS, NOISES, Cell, boards, cell_of, find, random_cell, reference
 
 NOISE = NOISES[0]
@@ -96,6 +98,22 @@ class TestWithoutNominal:
         found = refined(replace(data, pixels=hidden, board_poses=list(poses)), cell.knowns, NOISE)
         error = cell.error(found.T_P_A, found.T_H_E)
         assert error @ np.linalg.solve(found.covariance, error) < 40
+
+    @settings(max_examples=20, deadline=None)
+    @given(st.floats(-15, -1), st.integers(0, 8), st.floats(-0.5, 0.5))
+    def test_a_candidate_with_a_corner_all_but_in_the_cameras_plane_is_just_a_bad_one(
+        self, depth: float, corner: int, tilt: float
+    ) -> None:
+        cell = reference()
+        knowns = replace(cell.knowns, distortion=np.array([-0.2, 0.05, 1e-3, -1e-3, 0.0]))
+        board = transform(rotation_from_vector([tilt, 1.0, 0.0]), np.zeros(3))
+        # As near to the plane as that, and the others in front of it or behind it.
+        board[:3, 3] = [0.1, 0.1, 10**depth] - board[:3, :3] @ knowns.corners[corner] * [0, 0, 1]
+        data = replace(cell.data, board_poses=[board] * len(cell.data))
+        poses = camera_candidates(Model(data, knowns, NOISE), data.order, data.board_poses, True)
+        assert np.isfinite(poses.normal).all()
+        found = refined(replace(data, pixels=replace(cell, knowns=knowns).seen()), knowns, NOISE)
+        np.testing.assert_allclose(cell.error(found.T_P_A, found.T_H_E), 0, atol=1e-6)
 
     def test_unknown_order_is_found(self) -> None:
         cell = reference()

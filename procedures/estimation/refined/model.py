@@ -20,6 +20,11 @@ from procedures.estimation.refined.motion import adjoint, in_flange, moved
 CELL = 12
 """Unknowns of the cell: motions of T_P_A, then of T_H_E."""
 
+# Tangent of the angle off the optical axis, some 84 deg, beyond which no lens of this distortion has an image: a point
+# there counts as behind the camera. Nearer to the camera's plane the distortion's powers of the tangent, and with them
+# the information of a corner, outgrow what can be computed with.
+_WIDEST = 10.0
+
 
 @dataclass(frozen=True)
 class State:
@@ -122,13 +127,13 @@ class Model:
         return State(T_P_A, T_H_E, np.zeros((self.arrivals, active)), np.zeros((self.captures, passive)))
 
     def cost(self, state: State) -> float:
-        """Sum of squares in units of sigma; infinite if a corner that was seen is not in front of the camera."""
+        """Sum of squares in units of sigma; infinite if a corner that was seen is where no camera sees it."""
         squares = float(np.sum(self.residuals(state) ** 2) + np.sum(state.active**2) + np.sum(state.passive**2))
         return squares if np.isfinite(squares) else np.inf
 
     def residuals(self, state: State) -> Array:
         """(k, n, 2) of the pixels in units of sigma, 0 for a corner that was not seen."""
-        in_camera = apply(self._target_in_camera(state)[1], self.knowns.corners)
+        in_camera = self._in_front(self._target_in_camera(state)[1])
         return self._whitened(project(in_camera, self.knowns.matrix, self.knowns.distortion))
 
     def linearised(self, state: State) -> Linearised:
@@ -175,7 +180,7 @@ class Model:
         if flipped is not None:
             pixels = np.where(flipped[:, None, None], pixels[:, ::-1], pixels)
             seen = np.where(flipped[:, None], seen[:, ::-1], seen)
-        in_camera = apply(T_E_T, self.knowns.corners)
+        in_camera = self._in_front(T_E_T)
         found, J_pixel = project_with_jacobian(in_camera, self.knowns.matrix, self.knowns.distortion)
         # A motion (v, w) of T_P_E moves a point's coordinates p in the camera by -v + p x w.
         J = np.concatenate([-J_pixel, J_pixel @ skew(in_camera)], axis=-1)
@@ -232,6 +237,12 @@ class Model:
         passive = self.noise.passive * (self.J_passive @ state.passive[..., None])[..., 0]
         T_E_P = inverse(state.T_P_A @ moved(self.T_A_H, active) @ state.T_H_E)
         return T_E_P, T_E_P[self.arrival] @ moved(self.T_P_F, passive) @ self.knowns.T_F_T
+
+    def _in_front(self, T_E_T: Array) -> Array:
+        """(b, n, 3): corners of boards T_E_T (b, 4, 4) in the camera, NaN for those that no lens shows."""
+        corners = apply(T_E_T, self.knowns.corners)
+        shown = np.linalg.norm(corners[..., :2], axis=-1) < _WIDEST * corners[..., 2]
+        return np.where(shown[..., None], corners, np.nan)
 
     def _whitened(self, pixels: Array) -> Array:
         r = np.where(self.seen[..., None], pixels - self.pixels, 0.0) / self.noise.pixel

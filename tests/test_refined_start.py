@@ -15,9 +15,10 @@ from procedures.estimation import Degenerate
 from procedures.estimation.refined.closed_form import solve
 from procedures.estimation.refined.data import CaptureArrays, Noise
 from procedures.estimation.refined.estimate import refined
+from procedures.estimation.refined.fit import minimise
 from procedures.estimation.refined.model import Model
 from procedures.estimation.refined.motion import moved
-from procedures.estimation.refined.resection import plane_poses, resect
+from procedures.estimation.refined.resection import few_point_poses, plane_poses, resect
 from procedures.estimation.refined.start import camera_candidates
 from tools.benchmarks.refined import LIMITS, NOISES, Cell, boards, cell_of, find, random_cell, reference
 
@@ -49,6 +50,16 @@ class TestResection:
         rays = in_camera[..., :2] / in_camera[..., 2:]
         found = resect(points, rays, np.ones((3, 9)), np.zeros(3, dtype=np.intp), 1)
         np.testing.assert_allclose(found[0], T_E_P, atol=1e-9)
+
+    @settings(max_examples=50, deadline=None)
+    @given(seeds, st.integers(4, 8))
+    def test_the_cameras_pose_is_among_those_from_few_points(self, seed: int, count: int) -> None:
+        rng = np.random.default_rng(seed)
+        T_E_P = any_pose(rng)
+        in_camera = rng.uniform([-0.1, -0.1, 0.3], [0.1, 0.1, 0.5], (count, 3))
+        points = (in_camera - T_E_P[:3, 3]) @ T_E_P[:3, :3]
+        found = few_point_poses(points, in_camera[:, :2] / in_camera[:, 2:])
+        assert np.abs(found - T_E_P).max(axis=(1, 2)).min() < 0.1
 
     def test_a_plane_board_gives_its_pose_and_the_twin(self) -> None:
         corners = reference().knowns.corners
@@ -94,7 +105,9 @@ class TestWithoutNominal:
         T_P_E = cell.T_P_A @ cell.knowns.active.forward(data.active) @ cell.T_H_E
         poses = inverse(T_P_E) @ cell.knowns.passive.forward(data.passive) @ cell.knowns.T_F_T
         hidden = data.pixels.copy()
-        hidden[:, 3:] = np.nan  # three corners are too few for a homography
+        hidden[:, 2:] = np.nan  # two points show no pose of the camera
+        with pytest.raises(Degenerate, match="at no arrival three points were seen"):
+            refined(replace(data, pixels=hidden), cell.knowns, NOISE)
         found = refined(replace(data, pixels=hidden, board_poses=list(poses)), cell.knowns, NOISE)
         error = cell.error(found.T_P_A, found.T_H_E)
         assert error @ np.linalg.solve(found.covariance, error) < 40
@@ -132,6 +145,53 @@ class TestWithoutNominal:
         cell = replace(cell, data=replace(cell.data, pixels=cell.seen()))
         found = refined(cell.data, cell.knowns, NOISE)
         np.testing.assert_allclose(cell.error(found.T_P_A, found.T_H_E), 0, atol=1e-7)
+
+
+def showing(cell: Cell, corners: list[int], seed: int) -> CaptureArrays:
+    """Noisy captures of which nothing but these corners of their boards was seen."""
+    data = cell.noisy(np.random.default_rng(seed), NOISE)
+    pixels = np.full_like(data.pixels, np.nan)
+    pixels[:, corners] = data.pixels[:, corners]
+    return replace(data, pixels=pixels)
+
+
+class TestFewPointsOfEachBoard:
+    """The captures of an arrival are one target, however little each of them shows of its board."""
+
+    @pytest.mark.parametrize("positions", [3, 4, 8])
+    @pytest.mark.parametrize("corners", [[0], [3, 4]], ids=["one corner", "two corners"])
+    def test_they_lead_to_the_optimum_that_is_reached_from_the_truth(self, positions: int, corners: list[int]) -> None:
+        cell = random_cell(np.random.default_rng(positions), 7, positions)
+        data = showing(cell, corners, positions)
+        found = refined(data, cell.knowns, NOISE, further_starts=[(np.eye(4), np.eye(4))])
+        model = Model(data, cell.knowns, NOISE)
+        best = minimise(model, model.state(cell.T_P_A, cell.T_H_E))
+        assert found.dropped == ()
+        assert found.cost == pytest.approx(best.at.cost, rel=1e-6)
+        error = cell.error(found.T_P_A, found.T_H_E)
+        assert error @ np.linalg.solve(found.covariance, error) < 40
+
+    def test_arrivals_of_fewer_points_than_show_a_pose_only_join_later(self) -> None:
+        cell = random_cell(np.random.default_rng(0), 7, 8)
+        data = showing(cell, [0], 0)
+        first = np.unique(data.arrivals, return_index=True)[1]
+        data.pixels[(data.arrivals >= 5) & ~np.isin(np.arange(len(data)), first)] = np.nan
+        found = refined(data, cell.knowns, NOISE)
+        assert found.used.sum() == 5 * 8 + 2
+        error = cell.error(found.T_P_A, found.T_H_E)
+        assert error @ np.linalg.solve(found.covariance, error) < 40
+
+    @pytest.mark.parametrize("positions", [4, 8])
+    def test_feature_points_on_the_optical_axis_are_refused_with_what_helps(self, positions: int) -> None:
+        """Turned about that axis or shifted along it the camera sees them alike."""
+        cell = random_cell(np.random.default_rng(0), 7, positions)
+        data = showing(cell, [4], 0)
+        model = Model(data, cell.knowns, NOISE)
+        sigmas = np.sqrt(np.diag(np.linalg.inv(model.linearised(model.state(cell.T_P_A, cell.T_H_E)).normal)))
+        assert sigmas[8] > 0.01
+        assert sigmas[11] > np.radians(1)
+        with pytest.raises(Degenerate, match=r"lie on one line.*captures that show corners.*method paper"):
+            refined(data, cell.knowns, NOISE)
 
 
 def turned_to(turns: Array, shifts: Array | None = None, seed: int = 0, most_tilt: float = 45.0) -> Cell:

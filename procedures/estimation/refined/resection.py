@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+from itertools import permutations, product
+
 import numpy as np
 
 from dualcal_hal.transforms import Array, Mask, inverse, rotation_from_vector, transform
 from procedures.estimation.refined.closed_form import rotations
 from procedures.estimation.refined.data import Indices
 
+# Those of a cube: no rotation is farther than 63 deg from one of them.
+_TURNS = np.array(
+    [
+        turn
+        for order in permutations(np.eye(3))
+        for signs in product((1.0, -1.0), repeat=3)
+        if np.linalg.det(turn := np.array(signs)[:, None] * np.array(order)) > 0
+    ]
+)
+_MOST_STEPS = 100
+_STEADY = 1e-6
+
 
 def resect(points: Array, rays: Array, weights: Array, groups: Indices, count: int) -> Array:
     """T_E_P (count, 4, 4) of groups of captures, each group's points being one target that is not plane.
 
     points (k, n, 3) in P; rays (k, n, 2): normalised undistorted coordinates; weights (k, n), 0 for a corner not
-    seen; groups (k,): the group of each capture, below ``count``. The direct linear transform: a group of points in
-    one plane comes to nonsense.
+    seen; groups (k,): the group of each capture, below ``count``. The direct linear transform: a group of fewer than
+    six points, or of points in one plane, comes to nonsense.
     """
     total = _summed(weights.sum(axis=1), groups, count)
     centre = _summed(np.einsum("kn,kni->ki", weights, points), groups, count) / np.maximum(total, 1e-12)[:, None]
@@ -25,7 +39,7 @@ def resect(points: Array, rays: Array, weights: Array, groups: Indices, count: i
     equations = np.zeros((*points.shape[:2], 2, 12))
     equations[:, :, 0, :4] = equations[:, :, 1, 4:8] = places
     equations[:, :, :, 8:] = -rays[..., None] * places[:, :, None, :]
-    rows = (equations * np.sqrt(weights)[..., None, None]).reshape(len(points), -1, 12)
+    rows = (equations * np.sqrt(weights)[..., None, None]).reshape(len(points), 2 * points.shape[1], 12)
     camera = np.linalg.eigh(_summed(np.swapaxes(rows, 1, 2) @ rows, groups, count))[1][..., 0].reshape(-1, 3, 4)
     # Points are in front of a camera that is no mirror.
     camera = camera * np.where(np.linalg.det(camera[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
@@ -33,6 +47,26 @@ def resect(points: Array, rays: Array, weights: Array, groups: Indices, count: i
     R = rotations(camera[:, :, :3])
     p = camera[:, :, 3] / (size * scale)[:, None] - (R @ centre[..., None])[..., 0]
     return transform(R, p)
+
+
+def few_point_poses(points: Array, rays: Array) -> Array:
+    """T_E_P candidates (24, 4, 4) from at least three points (n, 3) in P that are not on one line, and their rays
+    (n, 2): the orthogonal iteration of Lu, Hager and Mjolsness (IEEE Trans. PAMI 22, 2000) from rotations all round.
+    """
+    sight = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+    along = sight[:, :, None] * sight[:, None, :] / np.sum(sight**2, axis=1)[:, None, None]
+    across = np.eye(3) - along
+    inner = np.linalg.pinv(across.sum(axis=0))
+    middle = points - points.mean(axis=0)
+    R = _TURNS
+    for _ in range(_MOST_STEPS):
+        turned = points @ np.swapaxes(R, 1, 2)
+        p = -np.einsum("nij,snj->si", across, turned) @ inner
+        on_rays = np.einsum("nij,snj->sni", along, turned + p[:, None])
+        before, R = R, rotations(np.swapaxes(on_rays, 1, 2) @ middle)
+        if np.abs(R - before).max() < _STEADY:
+            break
+    return transform(R, -np.einsum("nij,snj->si", across, points @ np.swapaxes(R, 1, 2)) @ inner)
 
 
 def plane_poses(corners: Array, rays: Array, seen: Mask) -> Array:

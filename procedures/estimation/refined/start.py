@@ -20,12 +20,17 @@ from procedures.estimation.refined.closed_form import solve
 from procedures.estimation.refined.data import Indices
 from procedures.estimation.refined.model import Model, marginalised
 from procedures.estimation.refined.motion import adjoint, motion_between, moved
-from procedures.estimation.refined.resection import camera_poses, plane_poses, resect
+from procedures.estimation.refined.resection import camera_poses, few_point_poses, plane_poses, resect
 
 # How far off, in sigmas rms, a capture or an arrival may be without being weighed down, step by step: a first value is
 # far from what all agree on, and at the end only those that fit should decide.
 _POSE_SCALES = (100.0, 30.0, 10.0, 5.0, 3.0)
 _CELL_SCALES = (100.0, 30.0, 10.0, 5.0, 3.0, 3.0, 3.0)
+
+# Of a target's extent across a line or a plane to that along it, from where it is not on one: feature points aligned
+# to the optical axis come to 0.005, plane boards at different distances to 0.1.
+_THICK = 0.02
+_FEWEST_LINEAR, _FEWEST_POINTS = 6, 3
 
 _WELL = 9.0  # squares in units of sigma, of a number: all fit, there is nothing to weigh down
 
@@ -89,17 +94,18 @@ class Start:
 def camera_candidates(
     model: Model, order_known: Mask, board_poses: Sequence[ArrayLike | None] | None, thorough: bool
 ) -> Poses:
-    """Poses of the camera at each arrival. Thorough: from each capture's board alone too, for arrivals whose captures
-    do not fit together; else only for those with unknown order or a single capture. Raises Degenerate where nothing
-    shows a pose.
+    """Poses of the camera at each arrival, from all points seen there together. Thorough: from each capture's board
+    alone too, for arrivals whose captures do not fit together; else only for those with unknown order or where the
+    points together are one plane. Raises Degenerate where nothing shows a pose.
     """
     T_P_T = model.T_P_F @ model.knowns.T_F_T
     rays, seen = seen_rays(model)
     seen &= np.isfinite(rays).all(axis=-1)
-    arrival, T_P_E = _together(model, T_P_T, rays, seen)
-    together = np.bincount(model.arrival[seen.sum(axis=1) >= 4], minlength=model.arrivals)
+    target = _Target.of(model, apply(T_P_T, model.knowns.corners), seen)
+    arrival, T_P_E = target.linear(rays)
+    together = np.isin(np.arange(model.arrivals), arrival)
     unsure = np.bincount(model.arrival[~order_known], minlength=model.arrivals) > 0
-    alone = np.flatnonzero((seen.sum(axis=1) >= 4) & (thorough | (together < 2) | unsure)[model.arrival])
+    alone = np.flatnonzero((seen.sum(axis=1) >= 4) & (thorough | ~together | unsure)[model.arrival])
     if len(alone):
         boards = plane_poses(model.knowns.corners, rays[alone], seen[alone])
         for poses in (boards, boards[~order_known[alone]] @ HALF_TURN):
@@ -107,16 +113,71 @@ def camera_candidates(
             arrival = np.concatenate([arrival, np.repeat(model.arrival[of], 2)])
             T_P_E = np.concatenate([T_P_E, camera_poses(T_P_T[of][:, None], poses).reshape(-1, 4, 4)])
     for k, pose in enumerate(board_poses or ()):
-        if pose is not None and thorough | (together < 2)[model.arrival[k]]:
+        if pose is not None and thorough | ~together[model.arrival[k]]:
             given = np.asarray(pose, dtype=float).reshape(-1, 4, 4)
             arrival = np.concatenate([arrival, np.repeat(model.arrival[k], len(given))])
             T_P_E = np.concatenate([T_P_E, camera_poses(T_P_T[k], given)])
+    for a in np.setdiff1d(np.flatnonzero(target.few), arrival if not thorough else model.arrival[alone]):
+        of_arrival = seen & (model.arrival == a)[:, None]
+        poses = inverse(few_point_poses(target.places[of_arrival], rays[of_arrival]))
+        arrival = np.concatenate([arrival, np.repeat(a, len(poses))])
+        T_P_E = np.concatenate([T_P_E, poses])
     if not len(arrival):
-        raise Degenerate(
-            "none of them shows four corners of its board, or says where it saw it; by their feature points alone only"
-            " method paper estimates"
-        )
+        raise Degenerate(target.why_not())
     return _distinct(model, _agreed(model, T_P_T, order_known, arrival, T_P_E))
+
+
+@dataclass(frozen=True)
+class _Target:
+    """All that was seen at an arrival as one target: places (k, n, 3) in P of the corners that were ``seen`` (k, n);
+    points (a,): how many; thick, flat (a,): whether they are not in one plane, and not on one line.
+    """
+
+    model: Model
+    places: Array
+    seen: Mask
+    points: Indices
+    thick: Mask
+    flat: Mask
+
+    @classmethod
+    def of(cls, model: Model, places: Array, seen: Mask) -> _Target:
+        points, spread = np.zeros(model.arrivals, dtype=np.intp), np.zeros((model.arrivals, 3))
+        for a in range(model.arrivals):
+            mine = places[seen & (model.arrival == a)[:, None]]
+            points[a] = len(mine)
+            if len(mine) >= _FEWEST_POINTS:
+                spread[a] = np.linalg.svd(mine - mine.mean(axis=0), compute_uv=False)
+        thick, flat = (spread[:, i] > _THICK * spread[:, 0] for i in (2, 1))
+        return cls(model, places, seen, points, thick, flat)
+
+    @property
+    def few(self) -> Mask:
+        """(a,): arrivals whose points show a pose, though perhaps not to the linear method."""
+        return self.flat & (self.points >= _FEWEST_POINTS)
+
+    def linear(self, rays: Array) -> tuple[Indices, Array]:
+        """T_P_E of the arrivals with points enough, from all of these at once."""
+        usable = np.flatnonzero(self.thick & (self.points >= _FEWEST_LINEAR))
+        mine = np.flatnonzero(np.isin(self.model.arrival, usable))
+        groups = np.searchsorted(usable, self.model.arrival[mine])
+        seen = self.seen[mine]
+        shown = np.where(seen[..., None], rays[mine], 0.0)
+        T_E_P = resect(self.places[mine], shown, seen.astype(float), groups, len(usable))
+        return usable, inverse(T_E_P)
+
+    def why_not(self) -> str:
+        """Where no arrival shows a pose."""
+        if self.points.max(initial=0) < _FEWEST_POINTS:
+            return (
+                "at no arrival three points were seen, corners or feature points: take captures that show corners of"
+                " the board, or more positions a constraint"
+            )
+        return (
+            "the points seen at each arrival lie on one line, as feature points on the optical axis do, which shows"
+            " neither how the camera is turned about that line nor where on it: take captures that show corners of the"
+            " board; method paper takes these two from the nominal"
+        )
 
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -137,14 +198,6 @@ def seen_rays(model: Model) -> tuple[Array, Mask]:
             except ValueError:
                 continue
         return rays, seen
-
-
-def _together(model: Model, T_P_T: Array, rays: Array, seen: Mask) -> tuple[Indices, Array]:
-    """T_P_E of the arrivals with at least two captures, from all their corners at once."""
-    usable = np.bincount(model.arrival[seen.sum(axis=1) >= 4], minlength=model.arrivals) >= 2
-    places = apply(T_P_T, model.knowns.corners)
-    T_E_P = resect(places, np.where(seen[..., None], rays, 0.0), seen.astype(float), model.arrival, model.arrivals)
-    return np.flatnonzero(usable), inverse(T_E_P[usable])
 
 
 def _agreed(model: Model, T_P_T: Array, order_known: Mask, arrival: Indices, T_P_E: Array) -> Poses:

@@ -36,6 +36,11 @@ def refuse_one_axis(T_A_H: Array, optical_axes: Array, joint: float, words: Word
     off = T_A_H[:, :3, :3] - T_A_H[:, :3, :3].mean(axis=0)
     values = np.linalg.eigvalsh(np.einsum("kia,kib->ab", off, off) / len(off))
     wander = np.sqrt(np.maximum(values, 0.0))
+    if ONE_AXIS < wander[2] < limit:
+        raise Degenerate(
+            f"a joint noise of {1e3 * joint:.4g} mrad (1 sigma) hides how the {flange} turns: see that the joint sigma"
+            f" is right, or turn the {flange} further"
+        )
     if wander[2] < limit:
         raise Degenerate(f"the {flange} always has the same orientation: it was only shifted")
     if ONE_AXIS < wander[0] < limit:

@@ -185,13 +185,25 @@ class TestBadSets:
         assert not any(suspect.words.startswith(("the corners", "the stated pixel")) for suspect in suspects)
         assert suspects[0].words == "capture 31: it alone being off would explain the captures"
 
+    @pytest.mark.parametrize("turned", [3, 8])
+    def test_a_capture_with_its_corners_listed_from_the_other_end_is_named_as_such(self, turned: int) -> None:
+        cell, rng = reference(), np.random.default_rng(turned)
+        result = refined(cell.noisy(rng, NOISE), cell.knowns, NOISE)
+        data = OTHER.noisy(rng, NOISE)
+        data = data.turned(np.arange(len(data)) == turned)
+        suspects = next_suspects(result, result.captures.followed_by(data))
+        listed = "its corners alone being listed from the other end would explain the captures"
+        assert suspects[0].words == f"capture {28 + turned}: {listed}"
+        assert suspects[0].explains
+
     def test_no_pixel_sigma_is_named_where_the_corners_of_one_capture_alone_are_off(self) -> None:
         cell, rng = reference(), np.random.default_rng(0)
         taken = [each.noisy(rng, NOISE) for each in (cell, OTHER)]
         result = refined(taken[0], cell.knowns, NOISE)
         taken[1].pixels[3] += rng.normal(0, 2.0, (9, 2))
         suspects = next_suspects(result, taken[0].followed_by(taken[1]))
-        assert suspects[0].words.startswith("the corners")
+        assert suspects[0].words == "capture 31: it alone being off would explain the captures"
+        assert suspects[1].words.startswith("the corners")
 
     def test_a_capture_and_an_arrival_that_alone_are_off_are_named(self) -> None:
         cell, rng = reference(), np.random.default_rng(0)

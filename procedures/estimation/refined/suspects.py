@@ -50,7 +50,8 @@ def next_suspects(result: Refined, captures: CaptureArrays, names: Sequence[str]
     much, then the rest; in each group what is most often wrong first in real cells: the target's mount, the zeros of
     the joints, the calibration of the arms, a capture or an arrival that alone is off, and what no calibration mends,
     which is all the same as joint sigmas that are stated too small. Before these corners that are off whatever board,
-    with the pixel sigma that explains them if one does; and none of these where one cell fits all captures.
+    with the pixel sigma that explains them if one does, and before them the capture that alone has them off; and none
+    of these where one cell fits all captures.
 
     captures: all of them, in any order; names: of each, by default its index.
     """
@@ -60,7 +61,11 @@ def next_suspects(result: Refined, captures: CaptureArrays, names: Sequence[str]
         as_given = _fitted(result, captures, result.inexact)
     except (Degenerate, np.linalg.LinAlgError):
         return (Suspect(_LOOSE, 0.0, False),)
-    corners = (*_pixel_sigma(result, captures, as_given), _CORNERS) if as_given.corners_off() else ()
+    corners: tuple[Suspect, ...] = ()
+    if as_given.corners_off():
+        corners = (*_pixel_sigma(result, captures, as_given), _CORNERS)
+        if not as_given.corners_alike():
+            corners = (*_one_capture(result, captures, as_given, called), *corners)
     if as_given.explains():
         return corners or (TOGETHER,)
     if any(suspect.explains for suspect in corners):
@@ -206,24 +211,39 @@ def _largest(known: Sequence[Known]) -> str:
 
 def _left_out(result: Refined, captures: CaptureArrays, as_given: _Fitted, called: Sequence[str]) -> Iterator[Suspect]:
     """The capture that fits worst, and the captures of the arrival that does, each left out."""
+    yield from _one_capture(result, captures, as_given, called)
     model = as_given.again.model
-    off = distances(model, as_given.again.fit)
-    capture = int(np.argmax(off.captures / np.maximum(off.freedom, 1)))
-    arrival = model.arrival == int(np.argmax(off.arrivals))
+    arrival = model.arrival == int(np.argmax(distances(model, as_given.again.fit).arrivals))
     ids = ", ".join(called[int(k)] for k in np.flatnonzero(arrival))
-    for what, out in (
-        (f"capture {called[capture]}", np.arange(len(captures)) == capture),
-        (f"where the active arm stood at {ids}", arrival),
-    ):
-        yield from _without(result, captures, as_given, what, out)
+    if _all_fit(result, captures, as_given, ~arrival):
+        yield _alone_off(f"where the active arm stood at {ids}", "it alone being off")
 
 
-def _without(result: Refined, captures: CaptureArrays, as_given: _Fitted, what: str, out: Mask) -> Iterator[Suspect]:
-    if len(np.unique(as_given.again.model.arrival[~out])) < _FEWEST_ARRIVALS:
+def _one_capture(
+    result: Refined, captures: CaptureArrays, as_given: _Fitted, called: Sequence[str]
+) -> Iterator[Suspect]:
+    """The one that fits worst, if that is all that is wrong; and whether its corners are but listed the other way."""
+    off = distances(as_given.again.model, as_given.again.fit)
+    worst = np.arange(len(captures)) == int(np.argmax(off.captures / np.maximum(off.freedom, 1)))
+    what = f"capture {called[int(np.argmax(worst))]}"
+    if not _all_fit(result, captures, as_given, ~worst):
         return
+    if _all_fit(result, captures.turned(worst), as_given, np.ones(len(captures), dtype=bool)):
+        yield _alone_off(what, "its corners alone being listed from the other end")
+    else:
+        yield _alone_off(what, "it alone being off")
+
+
+def _alone_off(what: str, words: str) -> Suspect:
+    return Suspect(f"{what}: {words} would explain the captures", 1.0, True)
+
+
+def _all_fit(result: Refined, captures: CaptureArrays, as_given: _Fitted, kept: Mask) -> bool:
+    """Whether the captures ``kept`` (k,) fit one cell, boards and corners."""
+    if len(np.unique(as_given.again.model.arrival[kept])) < _FEWEST_ARRIVALS:
+        return False
     try:
-        fitted = _fitted(result, captures.only(~out), result.inexact)
+        fitted = _fitted(result, captures.only(kept), result.inexact)
     except (Degenerate, np.linalg.LinAlgError):
-        return
-    if fitted.explains():
-        yield fitted.suspect(what, "it alone being off", as_given)
+        return False
+    return fitted.explains() and not fitted.corners_off()

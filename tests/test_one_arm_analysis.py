@@ -243,6 +243,28 @@ class TestVerdict:
         assert result.verdict == "fail"
         assert result.reasons[0].startswith("the views do not fit the stated noise")
 
+    def test_a_verification_view_that_alone_is_off_is_named(self, file, captures):
+        def shifted(capture: CaptureRecord) -> CaptureRecord:
+            return replace(capture, corners=tuple((u + 8.0, v) for u, v in capture.corners))
+
+        result = analysed(file, changed(captures, {"verification/01": shifted}))
+        assert result.verdict == "fail"
+        assert "not where they are predicted" in result.reasons[0]
+        assert result.reasons[1].startswith("it is verification/01/0 alone that is off")
+        assert "stood still" in result.reasons[1]
+        both = analysed(file, changed(captures, dict.fromkeys(("verification/01", "verification/02"), shifted)))
+        assert both.verdict == "fail"
+        assert not any("alone" in reason for reason in both.reasons)
+
+    def test_where_it_is_but_listed_from_the_other_end_it_says_so(self, file, captures):
+        def listed(capture: CaptureRecord) -> CaptureRecord:
+            return replace(capture, corners=capture.corners[::-1])
+
+        result = analysed(file, changed(captures, {"verification/02": listed}))
+        assert result.verdict == "fail"
+        assert result.reasons[1].startswith("it is verification/02/0 alone that is off")
+        assert result.reasons[1].endswith("so is this one with its corners listed from the other end")
+
     def test_all_tests_together_have_the_level(self, file, captures):
         """Verification and misfit each have half of it."""
         result = analysed(file, captures)

@@ -33,6 +33,7 @@ from procedures.analysis.board_poses import refuse_two_kinds_of_noise, refuse_wh
 from procedures.analysis.verification import words_for
 from procedures.estimation import Degenerate
 from procedures.estimation.refined import Limits, Refined
+from procedures.estimation.refined.data import CaptureArrays
 from procedures.estimation.refined.hidden import hidden_of_one_arm
 from procedures.estimation.refined.left_out import LeftOut, leave_one_out, predicted
 from procedures.estimation.refined.one_arm import OneArm, as_captures, described
@@ -81,16 +82,14 @@ def analyse_one_arm(captures: Captures, cell: OneArmCell, choices: Choices | Non
             estimate_inexact=estimated,
         )
         found = described(views, placement, result)
-        left_out = leave_one_out(
-            views, found, [one for one in inexact if estimated or not np.isfinite(one.sigmas).any()]
-        )
+        left_out = leave_one_out(views, found, [one for one in inexact if estimated or one.is_free])
     except Degenerate as error:
         raise DegenerateCaptures(f"the views do not tell where camera and target are: {error}") from error
-    proof = _verification(cell, result, kinds.verification) if kinds.verification else None
+    proof, lone = _verification(cell, result, kinds.verification) if kinds.verification else (None, ())
     accuracy = _accuracy(cell, found, (*kinds.calibration, *kinds.verification))
     fit = _fit_record(found, result)
     moved = tuple(_moved(cell, found, kinds.calibration))
-    verdict, reasons = _judge(moved, fit, proof, accuracy, _off(left_out, found.used))
+    verdict, reasons = _judge(moved, fit, proof, accuracy, _off(left_out, found.used), lone)
     reasons = (*reasons, *found.warnings, *words_for(kinds.rejected))
     return _result(config, found, kinds, fit, left_out, accuracy, proof, verdict=verdict, reasons=reasons)
 
@@ -158,7 +157,10 @@ def _cannot_be_seen(config: OneArmConfig, found: OneArm, captures: Sequence[Capt
         yield HiddenRecord(what=one.what, by=one.by, error_mm=1e3 * one.error)
 
 
-def _verification(cell: OneArmCell, result: Refined, captures: Sequence[CaptureRecord]) -> OneArmVerificationRecord:
+def _verification(
+    cell: OneArmCell, result: Refined, captures: Sequence[CaptureRecord]
+) -> tuple[OneArmVerificationRecord, tuple[str, ...]]:
+    """And what is said of the one view that alone is off, if it is one."""
     config = cell.one_arm
     listed, knowns = as_captures(views_of_captures(cell, captures), placement_of(config))
     data = in_order(result, listed)
@@ -167,7 +169,7 @@ def _verification(cell: OneArmCell, result: Refined, captures: Sequence[CaptureR
     off = predicted(data, result.knowns, result.T_P_A, result.T_H_E)
     before = predicted(data, knowns, inverse(config.nominal.target), config.nominal.camera)
     every = np.ones(len(captures), dtype=bool)
-    return OneArmVerificationRecord(
+    record = OneArmVerificationRecord(
         nominal=_off(before, every),
         found=_off(off, every),
         chi_square=min(looked_at.statistic, LARGEST),
@@ -176,6 +178,21 @@ def _verification(cell: OneArmCell, result: Refined, captures: Sequence[CaptureR
         least_probability=_LEAST_PROBABILITY,
         views=tuple(_verified(captures, off, looked_at, turned)),
     )
+    return record, tuple(_lone(result, data, looked_at, [capture.id for capture in captures]))
+
+
+def _lone(result: Refined, data: CaptureArrays, looked_at: Consistency, ids: Sequence[str]) -> Iterator[str]:
+    """The view that is farthest off, where the others are as predicted without it."""
+    if looked_at.probability >= _LEAST_PROBABILITY or len(data) == 1:
+        return
+    worst = np.arange(len(data)) == np.nanargmax(looked_at.captures / np.maximum(looked_at.freedoms, 1))
+    if verify(result, data.only(~worst)).probability < _LEAST_PROBABILITY:
+        return
+    words = f"it is {ids[int(np.argmax(worst))]} alone that is off, the other verification views are as predicted"
+    if verify(result, data.turned(worst)).probability >= _LEAST_PROBABILITY:
+        yield f"{words}; so is this one with its corners listed from the other end"
+    else:
+        yield f"{words}: look first at its image, and whether arm, camera and target stood still there"
 
 
 def _verified(
@@ -208,6 +225,7 @@ def _judge(
     proof: OneArmVerificationRecord | None,
     accuracy: PredictedRecord,
     left_out: OffRecord | None,
+    lone: tuple[str, ...],
 ) -> tuple[Verdict, tuple[str, ...]]:
     """A misfit widens the covariance, behind which verification views that are off could hide: so it counts too. And
     where something moved, what holds for the rest of the views need not hold for what comes after.
@@ -227,7 +245,7 @@ def _judge(
         look_at = (
             "look at whether target and camera are tight, at the joints' zeros, the arm's calibration, the intrinsics"
         )
-        return "fail", (*moved, *((verified, *misfit) if is_off else (*misfit, verified)), by_others, look_at)
+        return "fail", (*moved, *((verified, *lone, *misfit) if is_off else (*misfit, verified)), by_others, look_at)
     reasons = (f"the {len(proof.views)} verification views are where they are predicted: {said}", *misfit, by_others)
     if reached > required:
         return "coarse", (f"{error}, above the {required:g} mm required", *reasons)

@@ -7,12 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dualcal_hal.transforms import Mask
+from procedures.estimation.refined.data import CaptureArrays
 from procedures.estimation.refined.estimate import refined
 from procedures.estimation.refined.fit import minimise
+from procedures.estimation.refined.inexact import Inexact, target_mount
 from procedures.estimation.refined.model import Model
+from procedures.estimation.refined.motion import moved
 from procedures.estimation.refined.outliers import distances, predicted_distances
 from tools.benchmarks.misfit import MISFITS, Misfit
 from tools.benchmarks.refined import NOISES, contaminated, misread, reference, sort_out
+from tools.benchmarks.verification import turned_out
 
 NOISE = NOISES[0]
 
@@ -78,6 +83,47 @@ class TestSets:
         data.pixels[7] += 6
         assert refined(data, cell.knowns, NOISE, keep_all=True).used.all()
         assert not refined(data, cell.knowns, NOISE).used[7]
+
+
+def shifted_on_another_mount(seed: int, wrong: int) -> tuple[CaptureArrays, Mask]:
+    """Captures of a cell whose mount is off by 1 mm and 0.3 deg (1 sigma), so many with their corners 8 px off, and
+    which (k,).
+    """
+    cell, rng = reference(), np.random.default_rng(seed)
+    by = rng.normal(0, np.repeat([1e-3, np.radians(0.3)], 3))
+    true = replace(cell.knowns, T_F_T=moved(cell.knowns.T_F_T, by))
+    data = turned_out(cell, true).noisy(rng, NOISE)
+    out = np.isin(np.arange(len(data)), rng.choice(len(data), wrong, replace=False))
+    ways = rng.uniform(-np.pi, np.pi, wrong)
+    data.pixels[out] += 8 * np.column_stack([np.cos(ways), np.sin(ways)])[:, None]
+    return data, out
+
+
+MOUNTS = [target_mount(1e-3, float(np.radians(0.3))), target_mount(np.inf, np.inf)]
+
+
+@pytest.mark.parametrize("mount", MOUNTS, ids=["mount with a sigma", "free mount"])
+class TestWithAMountThatIsOff:
+    """Where what is wrong with the mount and with some captures has to be told apart."""
+
+    @pytest.mark.parametrize(("wrong", "seed"), [(3, 5), (5, 5), (5, 6)])
+    def test_just_those_that_are_wrong_are_dropped(self, mount: Inexact, wrong: int, seed: int) -> None:
+        data, out = shifted_on_another_mount(seed, wrong)
+        found = refined(data, reference().knowns, NOISE, inexact=[mount])
+        np.testing.assert_array_equal(~found.used, out)
+        assert found.scale == 1
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("wrong", [3, 5])
+    def test_in_set_after_set(self, mount: Inexact, wrong: int) -> None:
+        for seed in range(20, 30):
+            data, out = shifted_on_another_mount(seed, wrong)
+            np.testing.assert_array_equal(~refined(data, reference().knowns, NOISE, inexact=[mount]).used, out)
+
+    def test_of_clean_sets_none_is_dropped(self, mount: Inexact) -> None:
+        for seed in range(5):
+            data, _ = shifted_on_another_mount(seed, 0)
+            assert refined(data, reference().knowns, NOISE, inexact=[mount]).used.all()
 
 
 class TestMisfit:

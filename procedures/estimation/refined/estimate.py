@@ -44,6 +44,7 @@ _APART = 5e-3  # rad
 
 _SUSPICIOUS = 4.0  # squares this many times larger than the noise says: perhaps not the right optimum
 _MOST_ROUNDS = 12
+_KNOWN_ROUNDS = 6  # of knowns found from captures, and captures judged with these knowns
 
 # Captures that are all off, each in its own way, differ more from each other than noisy ones do: an outlier among them
 # is twice as far off as it is among others.
@@ -157,11 +158,11 @@ def refined(
     if any(is_free_mount(one) for one in inexact):
         mount = find_mount(data, knowns, noise)
         knowns = given if mount is None else replace(given, T_F_T=mount)
-    there = knowns
+    # What does not belong, and how large the noise is, is told only once the knowns are about right.
+    result = _estimate(data, knowns, noise, *fixed)
     if inexact:
-        # What does not belong, and how large the noise is, is told only once the knowns are about right.
-        there = _with_inexact(knowns, noise, _estimate(data, knowns, noise, *fixed), inexact, True).knowns
-    result, found = _estimate(data, there, noise, *fixed), None
+        result = _with_knowns_that_fit(data, knowns, noise, result, inexact, fixed)
+    there, found = result.knowns, None
     for _ in range(_NOISE_ROUNDS if estimate_noise else 0):
         found = find_noise(result.captures, there, noise, result.T_P_A, result.T_H_E)
         result = _estimate(data, there, found.noise, *fixed)
@@ -171,6 +172,38 @@ def refined(
         found_knowns = _with_inexact(knowns, result.noise, result, inexact, estimate_inexact)
         result = replace(_combined(result, counted_from(given, found_knowns), inexact, fixed[2]), prior=knowns)
     return replace(result, warnings=(*_uncertain(result.directions), *result.warnings))
+
+
+def _with_knowns_that_fit(
+    data: CaptureArrays,
+    knowns: Knowns,
+    noise: Noise,
+    first: Refined,
+    inexact: Sequence[Inexact],
+    fixed: tuple[Sequence[tuple[ArrayLike, ArrayLike]], bool, Limits],
+) -> Refined:
+    """The estimate with the knowns where they fit best the captures that it uses, from one with these as given."""
+    result = _estimate(data, _with_inexact(knowns, noise, first, inexact, True).knowns, noise, *fixed)
+    search = _Search.of(data, result.knowns, noise, keep_all=fixed[1])
+    if search.keep_all or (result.scale == 1 and np.array_equal(result.used, search.usable)):
+        return result
+    # Knowns found from captures that do not belong hide these, and may make others look as if they did not.
+    begun, seen_before = _different([result.used, first.used, search.usable]), [result.used]
+    for _ in range(_KNOWN_ROUNDS):
+        tried = search.trimmed_with(knowns, inexact, result, begun)
+        if tried is None:
+            break
+        result = _estimate(data, tried.model.knowns, noise, *fixed)
+        if any(np.array_equal(result.used, before) for before in (tried.used, *seen_before)):
+            break
+        seen_before.append(result.used)
+        begun = [result.used]
+    return result
+
+
+def _different(sets: Sequence[Mask]) -> list[Mask]:
+    """Each once, in their order."""
+    return list({used.tobytes(): used for used in sets}.values())
 
 
 def _with_inexact(
@@ -210,9 +243,8 @@ def _estimate(
     keep_all: bool,
     observable: Limits,
 ) -> Refined:
-    data = replace(data, arrivals=_by_reading(data))
-    every = Model(data, knowns, noise)
-    usable = every.seen.sum(axis=1) > 0
+    search = _Search.of(data, knowns, noise, keep_all)
+    data, every, usable = search.data, search.every, search.usable
     reached = np.unique(every.arrival[usable])
     refuse_few(len(reached))
     candidates = camera_candidates(every, data.order, data.board_poses, False)
@@ -222,7 +254,6 @@ def _estimate(
         Start(np.asarray(T_P_A, dtype=float), np.asarray(T_H_E, dtype=float), ~everybody, np.inf, everybody)
         for T_P_A, T_H_E in further_starts
     ]
-    search = _Search(data, every, usable, keep_all)
     plain = starts(every, candidates, False)
     solutions = search.solutions(plain, False)
     if not solutions or search.suspicious(solutions[0]):
@@ -269,6 +300,12 @@ class _Search:
     usable: Mask
     keep_all: bool
     farther: float = 1.0
+
+    @classmethod
+    def of(cls, data: CaptureArrays, knowns: Knowns, noise: Noise, keep_all: bool) -> _Search:
+        data = replace(data, arrivals=_by_reading(data))
+        every = Model(data, knowns, noise)
+        return cls(data, every, every.seen.sum(axis=1) > 0, keep_all)
 
     def share_out(self, solution: _Solution) -> float:
         """Of the captures, those left out."""
@@ -328,6 +365,45 @@ class _Search:
             if any(np.array_equal(used, before) for before in seen_before):
                 break
             seen_before.append(used)
+        return solution
+
+    def trimmed_with(
+        self, knowns: Knowns, inexact: Sequence[Inexact], near: Refined, begun: Sequence[Mask]
+    ) -> _Solution | None:
+        """The best from the cell of another estimate and each of the sets of captures ``begun`` (k,), or the first that
+        explains all, as :meth:`_trimmed_with`.
+        """
+        found = []
+        for used in begun:
+            solution = self._trimmed_with(knowns, inexact, near, used)
+            if solution is not None:
+                found.append(solution)
+                if self.explained(solution, _FEW):
+                    break
+        return _best_first(found)[0] if found else None
+
+    def _trimmed_with(self, knowns: Knowns, inexact: Sequence[Inexact], near: Refined, used: Mask) -> _Solution | None:
+        """As :meth:`_trimmed`, with the knowns found anew each time from the captures that are left."""
+        T_P_A, T_H_E, flipped = near.T_P_A, near.T_H_E, near.flipped
+        solution: _Solution | None = None
+        seen_before: list[Mask] = []
+        for _ in range(len(self.data)):
+            seen_before.append(used)
+            kept = self.data.turned(flipped).only(used)
+            start = Model(kept, near.knowns, self.every.noise).state(T_P_A, T_H_E)
+            try:
+                found = fit_inexact(kept, knowns, self.every.noise, start, inexact, True)
+            except (Degenerate, np.linalg.LinAlgError):
+                break  # the captures left are too few to see the knowns in
+            T_P_A, T_H_E = found.fit.state.T_P_A, found.fit.state.T_H_E
+            there = replace(self, every=Model(self.data, found.knowns, self.every.noise))
+            again = there._fitted(T_P_A, T_H_E, used, flipped)
+            if again is None:
+                break
+            solution = again
+            used, flipped = there._judged(solution)
+            if any(np.array_equal(used, before) for before in seen_before):
+                break
         return solution
 
     def _judged(self, solution: _Solution) -> tuple[Mask, Mask]:

@@ -16,6 +16,7 @@ from procedures.estimation.refined import (
     Inexact,
     Knowns,
     Refined,
+    free_intrinsics,
     intrinsics,
     joint_zeros,
     link_parameters,
@@ -212,6 +213,35 @@ def _only(one: Inexact, index: int) -> dict[str, Any]:
         "scale": one.scale[at],
         "shifted": shifted,
     }
+
+
+class TestFreeLens:
+    """Small boards in the middle of the image, which hardly show it."""
+
+    @pytest.mark.parametrize("seed", [1, 5])
+    def test_it_is_found_as_exactly_as_is_said_also_with_the_mount(self, seed: int) -> None:
+        cell = reference()
+        small = replace(cell, knowns=replace(cell.knowns, corners=0.48 * cell.knowns.corners))
+        data = replace(cell.data, pixels=small.seen())
+        taken = replace(small, data=data).noisy(np.random.default_rng(seed), NOISE)
+        found = refined(taken, small.knowns, NOISE, inexact=[free_intrinsics(), target_mount(np.inf, np.inf)])
+        error = cell.error(found.T_P_A, found.T_H_E)
+        assert error @ np.linalg.solve(found.covariance, error) < 33  # 0.1 % of chi-squares of 12
+        assert not any("converged" in words for words in found.warnings)
+
+    def test_what_moves_no_corner_is_said(self) -> None:
+        cell = reference()
+        small = replace(cell, knowns=replace(cell.knowns, corners=0.48 * cell.knowns.corners))
+        taken = replace(small, data=replace(cell.data, pixels=small.seen())).noisy(np.random.default_rng(1), NOISE)
+        found = refined(taken, small.knowns, NOISE, inexact=[free_intrinsics()])
+        assert "cannot be seen in the captures: k3" in found.warnings
+
+
+def test_knowns_that_are_not_found_in_time_are_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("procedures.estimation.refined.inexact._MOST_STEPS", 1)
+    cell = off([LENS], np.random.default_rng(0))
+    found = refined(cell.noisy(np.random.default_rng(0), NOISE), reference().knowns, NOISE, inexact=[LENS])
+    assert "the estimate has not converged" in found.warnings
 
 
 HIDDEN = {

@@ -17,6 +17,7 @@ from procedures.estimation.refined import (
     Inexact,
     Knowns,
     Noise,
+    free_intrinsics,
     intrinsics,
     joint_zeros,
     link_parameters,
@@ -96,7 +97,7 @@ def _of_target(cell: CellConfig, free: Sequence[str]) -> Iterator[Inexact]:
 def _of_camera(cell: CellConfig, free: Sequence[str]) -> Iterator[Inexact]:
     sigma = cell.camera.intrinsics_sigma
     if "intrinsics" in free:
-        yield intrinsics(np.inf, np.inf, [np.inf] * 5)
+        yield free_intrinsics()
     elif sigma is not None and (sigma.focal_px or sigma.centre_px or any(sigma.distortion)):
         yield intrinsics(sigma.focal_px, sigma.centre_px, sigma.distortion)
 

@@ -14,12 +14,12 @@ import numpy as np
 from dualcal_hal.transforms import Array, Mask, inverse
 from procedures.estimation.degenerate import Degenerate
 from procedures.estimation.refined.data import Knowns, Noise
-from procedures.estimation.refined.inexact import Inexact, intrinsics
+from procedures.estimation.refined.inexact import Inexact, free_intrinsics
 from procedures.estimation.refined.model import CELL, Model
 from procedures.estimation.refined.one_arm import OneArm, Views
 from procedures.estimation.refined.refit import Refit, refit
 
-FREE_LENS = (intrinsics(np.inf, np.inf, [np.inf] * 5),)
+FREE_LENS = (free_intrinsics(),)
 
 _FREE_POSE = 0.05  # rad: far more than any arm is off
 _PIXEL = 0.1  # px

@@ -57,6 +57,7 @@ _MISFIT = 900.0  # squares larger by more than this are not of arms, mounts or c
 
 _NOISE_ROUNDS = 2  # what is found for the noise moves the estimate, which hardly moves what is found
 _SIGNIFICANT = 1e-3
+_UNCONVERGED = "the estimate has not converged"
 _LARGE = 0.005  # m; a predicted sigma above it is warned of
 
 
@@ -220,6 +221,8 @@ def _combined(result: Refined, found: WithInexact, inexact: Sequence[Inexact], o
     covariance = joint[:CELL, :CELL]
     hidden = [known.name for known in found.known if not known.seen]
     words = [f"cannot be seen in the captures: {', '.join(hidden)}"] if hidden else []
+    if not found.fit.converged and _UNCONVERGED not in result.warnings:
+        words.append(_UNCONVERGED)
     return replace(
         result,
         T_P_A=found.fit.state.T_P_A,
@@ -581,7 +584,7 @@ def _uncertain(found: Sequence[Direction]) -> list[str]:
 def _warnings(fit: Fit, scale: float, alternatives: Sequence[Alternative]) -> list[str]:
     words = []
     if not fit.converged:
-        words.append("the estimate has not converged")
+        words.append(_UNCONVERGED)
     if scale > 1:
         words.append(
             f"residuals are {np.sqrt(scale):.1f} times what the stated noise explains; the covariance is widened"

@@ -1,7 +1,7 @@
 """Knowns that are not exact: estimated with what is known of them as a prior, or only reckoned with.
 
 Each is a few numbers by which the knowns are off, zero where they are exact, with a sigma each; an infinite sigma frees
-one. The cell and the arms are fitted for given knowns; the knowns follow by Gauss-Newton steps on what that leaves.
+one. The cell and the arms are fitted for given knowns; the knowns follow by Levenberg-Marquardt on what that leaves.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ UNSEEN = 0.98
 """Of its prior sigma: what the captures do not make smaller than this, they do not see."""
 
 _STEP = 1e-5  # m, rad, or a part of one: of the differences
-_MOST_ROUNDS = 10
-_CONVERGED = 1e-3  # of a posterior sigma
+_MOST_STEPS = 60
+_DAMPING = (1e-4, 1e10)  # at first, and where no step helps any more
+_LEAST_DAMPING = 1e-9
+_CONVERGED = 1e-3  # sigmas
+_ROUNDING = 1e-9  # of a cost
 _SINGULAR = 1e-8  # of the scaled information, a square
 
 
@@ -41,6 +44,11 @@ class Inexact:
     sigmas: Array
     scale: Array
     shifted: Callable[[Knowns, Array], Knowns]
+
+    @property
+    def is_free(self) -> bool:
+        """Whether some of it has no prior: then all of it is estimated."""
+        return not bool(np.all(np.isfinite(self.sigmas)))
 
 
 def target_mount(translation: float, rotation: float) -> Inexact:
@@ -75,6 +83,18 @@ def intrinsics(focal: float, centre: float, distortion: Sequence[float]) -> Inex
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     units = ("px",) * 4 + ("",) * 5
     return _without_exact("intrinsics", names, units, sigmas, np.array([1e3] * 4 + [1.0] * 5), shifted)
+
+
+# Sigmas of what lenses have, with room: of a coefficient either the captures know far more, or it moves no corner that
+# was seen.
+_LENS = (1.0, 10.0, 0.05, 0.05, 100.0)
+
+
+def free_intrinsics() -> Inexact:
+    """Focal lengths and principal point free, the coefficients within what lenses have: a board that is only seen in
+    the middle of the image shows nothing of them.
+    """
+    return intrinsics(np.inf, np.inf, _LENS)
 
 
 def joint_zeros(arm: str, sigmas: Sequence[float]) -> Inexact:
@@ -197,27 +217,14 @@ def fit_inexact(
     seen.
     """
     sigmas = np.concatenate([one.sigmas for one in inexact])
-    free = ~np.isfinite(sigmas)
-    sought = free | estimated
-    precision = np.where(free, 0.0, 1 / sigmas**2)
-    theta = np.zeros(len(sigmas))
-    model = Model(data, knowns, noise)
-    fit = minimise(model, start)
-    for _ in range(_MOST_ROUNDS):
-        cross, own, gradient = information(data, knowns, noise, inexact, theta, model, fit)
-        left = own - cross.T @ np.linalg.solve(fit.at.normal, cross) + np.diag(precision)
-        size = np.sqrt(np.diag(own) + precision)
-        posterior = np.sqrt(np.diag(_inverted(left, size, inexact, np.ones_like(sought))))
-        if not sought.any():
-            covariance = np.zeros_like(left)
-            break
-        covariance = _inverted(left, size, inexact, sought)
-        step = -covariance @ (gradient + precision * theta)
-        theta = theta + step
-        model = Model(data, _shifted(knowns, inexact, theta), noise)
-        fit = minimise(model, fit.state)
-        if np.all(np.abs(step) < _CONVERGED * posterior):
-            break
+    precision = np.where(np.isfinite(sigmas), 1 / sigmas**2, 0.0)
+    sought = np.concatenate([np.full(len(one.sigmas), estimated or one.is_free) for one in inexact])
+    search = _Search(data, knowns, noise, inexact, precision, sought)
+    there, converged = search.descended(search.at(np.zeros(len(sigmas)), start))
+    model, fit, cross, theta = there.model, there.fit, there.cross, there.theta
+    left, size = search.left(there), search.size(there)
+    posterior = np.sqrt(np.diag(_inverted(left, size, inexact, np.ones_like(sought))))
+    covariance = _inverted(left, size, inexact, sought) if sought.any() else np.zeros_like(left)
     # What is only reckoned with draws along what is sought.
     through_sought = np.diag(np.where(sought, 0.0, 1.0))
     through_sought -= covariance @ left @ through_sought
@@ -228,7 +235,7 @@ def fit_inexact(
     # How the error of each sigma's number comes through: of a prior, and of what is only reckoned with.
     through = follow @ (covariance @ np.diag(precision) + through_sought)
     return WithInexact(
-        fit=fit,
+        fit=replace(fit, converged=fit.converged and converged),
         model=model,
         knowns=model.knowns,
         covariance=np.block([[of_cell, together], [together.T, spread]]),
@@ -240,6 +247,77 @@ def fit_inexact(
             for one, at in zip(inexact, _slices(inexact), strict=True)
         },
     )
+
+
+@dataclass(frozen=True)
+class _There:
+    """The fit of cell and arms with knowns that are off by ``theta`` (m,), what it says of these (see
+    :func:`information`), and the cost with that of their priors.
+    """
+
+    theta: Array
+    model: Model
+    fit: Fit
+    cross: Array
+    own: Array
+    gradient: Array
+    cost: float
+
+
+@dataclass(frozen=True)
+class _Search:
+    """For the numbers ``sought`` (m,), of prior ``precision`` (m,), by which knowns are off."""
+
+    data: CaptureArrays
+    knowns: Knowns
+    noise: Noise
+    inexact: Sequence[Inexact]
+    precision: Array
+    sought: Mask
+
+    def at(self, theta: Array, start: State) -> _There:
+        model = Model(self.data, _shifted(self.knowns, self.inexact, theta), self.noise)
+        fit = minimise(model, start)
+        cost = fit.at.cost + float(theta @ (self.precision * theta))
+        if not np.isfinite(cost):
+            none = np.zeros(0)
+            return _There(theta, model, fit, none, none, none, np.inf)
+        return _There(
+            theta, model, fit, *information(self.data, self.knowns, self.noise, self.inexact, theta, model, fit), cost
+        )
+
+    def left(self, there: _There) -> Array:
+        """Information (m, m) on the numbers, cell and arms marginalised."""
+        cross = there.cross
+        return np.asarray(there.own - cross.T @ np.linalg.solve(there.fit.at.normal, cross) + np.diag(self.precision))
+
+    def size(self, there: _There) -> Array:
+        """(m,): roots of the information there would be if all else were known."""
+        return np.asarray(np.sqrt(np.diag(there.own) + self.precision))
+
+    def descended(self, there: _There) -> tuple[_There, bool]:
+        """Where the cost is least, and whether that was reached."""
+        if not np.isfinite(there.cost):
+            raise Degenerate("nothing explains the captures, even roughly: some board should be behind the camera")
+        damping, most = _DAMPING
+        for _ in range(_MOST_STEPS if self.sought.any() else 0):
+            size = self.size(there)[self.sought]
+            scaled = self.left(there)[np.ix_(self.sought, self.sought)] / np.outer(size, size)
+            slope = (there.gradient + self.precision * there.theta)[self.sought] / size
+            step = np.linalg.solve(scaled + damping * np.eye(len(size)), -slope)
+            theta = there.theta.copy()
+            theta[self.sought] += step / size
+            tried = self.at(theta, there.fit.state)
+            if tried.cost <= there.cost * (1 + _ROUNDING):
+                there, damping = tried, max(damping / 10, _LEAST_DAMPING)
+                # In the metric of the information: by how many sigmas the step moves what is least certain.
+                if float(step @ scaled @ step) < _CONVERGED**2 and damping < 1e-2:
+                    return there, True
+            else:
+                damping *= 10
+                if damping > most:
+                    return there, False
+        return there, not self.sought.any()
 
 
 def information(

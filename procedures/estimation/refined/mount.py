@@ -141,9 +141,10 @@ def _on_corners(model: Model, which: Indices, T_E_T: Array) -> tuple[Array, Mask
         gradient = np.where(better[:, None], at.gradient, gradient)
         damping = np.where(better, damping / 10, damping * 10)
     least = np.full(model.captures, np.inf)
-    np.minimum.at(least, which, squares)
+    shown = np.isfinite(squares)
+    np.minimum.at(least, which[shown], squares[shown])
     # A twin whose corners are off three times as far as the best one's is none.
-    return inverse(T_T_E), np.isfinite(squares) & (squares <= 9 * least[which] + 9 * model.freedom[which])
+    return inverse(T_T_E), shown & (squares <= 9 * least[which] + 9 * model.freedom[which])
 
 
 def _agreeing(model: Model, boards: _Boards) -> Iterator[_Agreeing]:

@@ -175,8 +175,8 @@ class _Target:
             )
         return (
             "the points seen at each arrival lie on one line, as feature points on the optical axis do, which shows"
-            " neither how the camera is turned about that line nor where on it: take captures that show corners of the"
-            " board; method paper takes these two from the nominal"
+            " neither how the camera is turned about that line nor where on it: take captures that show more corners of"
+            " the board; method paper takes these two from the nominal"
         )
 
 

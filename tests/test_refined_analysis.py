@@ -382,7 +382,7 @@ class TestKnowns:
 class TestWhatIsOdd:
     def test_captures_without_corners_are_for_the_other_method(self) -> None:
         captures = changed(noisy(1), "", lambda c: replace(c, corners=None))
-        with pytest.raises(DegenerateCaptures, match="four corners"):
+        with pytest.raises(DegenerateCaptures, match="lie on one line"):
             analyse(captures, cell(), "refined")
         assert analyse(captures, cell(), "paper").verdict == "ok"
 

@@ -27,8 +27,8 @@ _STEP = 1e-5  # m, rad, or a part of one: of the differences
 _MOST_STEPS = 60
 _DAMPING = (1e-4, 1e10)  # at first, and where no step helps any more
 _LEAST_DAMPING = 1e-9
-_CONVERGED = 1e-3  # sigmas
-_ROUNDING = 1e-9  # of a cost
+_CONVERGED = 1e-2  # sigmas that a step without damping would go
+_INNER_GAIN = 1e-4  # of the cost, what the fit of cell and arms leaves
 _SINGULAR = 1e-8  # of the scaled information, a square
 
 
@@ -304,15 +304,13 @@ class _Search:
             size = self.size(there)[self.sought]
             scaled = self.left(there)[np.ix_(self.sought, self.sought)] / np.outer(size, size)
             slope = (there.gradient + self.precision * there.theta)[self.sought] / size
-            step = np.linalg.solve(scaled + damping * np.eye(len(size)), -slope)
+            if float(slope @ np.linalg.solve(scaled + _LEAST_DAMPING * np.eye(len(size)), slope)) < _CONVERGED**2:
+                return there, True
             theta = there.theta.copy()
-            theta[self.sought] += step / size
+            theta[self.sought] -= np.linalg.solve(scaled + damping * np.eye(len(size)), slope) / size
             tried = self.at(theta, there.fit.state)
-            if tried.cost <= there.cost * (1 + _ROUNDING):
+            if tried.cost < there.cost + _INNER_GAIN:
                 there, damping = tried, max(damping / 10, _LEAST_DAMPING)
-                # In the metric of the information: by how many sigmas the step moves what is least certain.
-                if float(step @ scaled @ step) < _CONVERGED**2 and damping < 1e-2:
-                    return there, True
             else:
                 damping *= 10
                 if damping > most:

@@ -24,11 +24,13 @@ UNSEEN = 0.98
 """Of its prior sigma: what the captures do not make smaller than this, they do not see."""
 
 _STEP = 1e-5  # m, rad, or a part of one: of the differences
-_MOST_STEPS = 60
+_MOST_STEPS = 25
 _DAMPING = (1e-4, 1e10)  # at first, and where no step helps any more
 _LEAST_DAMPING = 1e-9
-_CONVERGED = 1e-2  # sigmas that a step without damping would go
-_INNER_GAIN = 1e-4  # of the cost, what the fit of cell and arms leaves
+_FREE_STEP = 1.0  # damping below which a step goes about as far as it would without
+
+# In units of sigma squared, as large as the captures show them: what the fit of cell and arms leaves, too.
+_SMALLEST_GAIN = 1e-4
 _SINGULAR = 1e-8  # of the scaled information, a square
 
 
@@ -304,13 +306,14 @@ class _Search:
             size = self.size(there)[self.sought]
             scaled = self.left(there)[np.ix_(self.sought, self.sought)] / np.outer(size, size)
             slope = (there.gradient + self.precision * there.theta)[self.sought] / size
-            if float(slope @ np.linalg.solve(scaled + _LEAST_DAMPING * np.eye(len(size)), slope)) < _CONVERGED**2:
-                return there, True
             theta = there.theta.copy()
             theta[self.sought] -= np.linalg.solve(scaled + damping * np.eye(len(size)), slope) / size
             tried = self.at(theta, there.fit.state)
-            if tried.cost < there.cost + _INNER_GAIN:
+            gain, least = there.cost - tried.cost, _SMALLEST_GAIN * max(1.0, there.cost / there.model.measurements)
+            if gain > -least:
                 there, damping = tried, max(damping / 10, _LEAST_DAMPING)
+                if gain < least and damping < _FREE_STEP:
+                    return there, True
             else:
                 damping *= 10
                 if damping > most:

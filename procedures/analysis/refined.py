@@ -22,12 +22,12 @@ from procedures.estimation.projection import undistort
 from procedures.estimation.refined import Inexact, Refined, refined
 from procedures.estimation.refined.suspects import TOGETHER, Suspect, next_suspects
 from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, Part, verify
+from procedures.figures import chance
 
 FREE = ("target_mount", "intrinsics")
 """Knowns that can be left to the captures altogether."""
 
 
-_TOLD = 1e-4  # a smaller probability is told as below it
 _MANY = 1e6  # squares, of which the number no longer counts
 _FEWEST_CAPTURES, _FEWEST_ARRIVALS = 3, 2  # to verify with; the captures of one arrival share its error
 
@@ -172,11 +172,11 @@ def _judge(seen: Verification | None, accuracy: Accuracy) -> tuple[Verdict, tupl
 def _said(seen: Verification) -> str:
     parts = [
         f"{what} chi-square {_squares(part.chi_square)} of {part.degrees_of_freedom},"
-        f" probability {_chance(part.probability)}"
+        f" probability {chance(part.probability)}"
         for what, part in (("boards", seen.poses), ("corners on their boards", seen.corners))
         if part is not None and part.degrees_of_freedom
     ]
-    both = f"; of either part (twice the smaller) {_chance(seen.probability)}" if len(parts) > 1 else ""
+    both = f"; of either part (twice the smaller) {chance(seen.probability)}" if len(parts) > 1 else ""
     return f"{'; '.join(parts)}{both}"
 
 
@@ -199,10 +199,6 @@ def _doubts(accuracy: Accuracy) -> Iterator[str]:
 
 def _squares(value: float) -> str:
     return f"{value:.1f}" if value < _MANY else f"{value:.1g}"
-
-
-def _chance(probability: float) -> str:
-    return f"{probability:.2g}" if probability >= _TOLD else f"below {_TOLD:g}"
 
 
 def _verification_record(

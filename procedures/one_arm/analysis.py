@@ -38,7 +38,7 @@ from procedures.estimation.refined.hidden import hidden_of_one_arm
 from procedures.estimation.refined.left_out import LeftOut, leave_one_out, predicted
 from procedures.estimation.refined.one_arm import OneArm, as_captures, described
 from procedures.estimation.refined.verification import LEAST_PROBABILITY, Consistency, in_order, verify
-from procedures.figures import two_digits
+from procedures.figures import chance, two_digits
 from procedures.one_arm.fit import estimate, inexact_of, joint_sigma, placement_of, views_of_captures
 from procedures.one_arm.sorting import Sorted, joints_of, sort_out
 
@@ -50,8 +50,6 @@ _FEWEST_OTHERS = 5
 
 _LEAST_PROBABILITY = LEAST_PROBABILITY / 2
 """Verification views and those calibrated with may either fail a result: each has half of the level."""
-
-_TOLD = 1e-4  # a smaller probability is told as below it
 
 _COMPONENTS = tuple(f"{what} {axis}" for what in ("translation", "rotation") for axis in "xyz")
 
@@ -266,10 +264,10 @@ def _said(off: OffRecord | None) -> str:
 
 
 def _chance(proof: OneArmVerificationRecord) -> str:
-    chance = f"{proof.probability:.2g}" if proof.probability >= _TOLD else f"below {_TOLD:g}"
+    probability = f"probability {chance(proof.probability)}"
     if proof.chi_square >= LARGEST:
-        return f"probability {chance}"
-    return f"chi-square {proof.chi_square:.0f} of {proof.degrees_of_freedom}, probability {chance}"
+        return probability
+    return f"chi-square {proof.chi_square:.0f} of {proof.degrees_of_freedom}, {probability}"
 
 
 def _fit_record(found: OneArm, result: Refined) -> OneArmFitRecord:

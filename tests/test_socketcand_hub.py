@@ -235,6 +235,33 @@ def test_a_lost_bus_puts_its_clients_out_and_takes_none_until_it_is_mended(hub: 
             pass
 
 
+def test_what_came_while_the_hub_stood_still_is_heard_before_anybody_looks_for_it() -> None:
+    hub = Hub(RealClock(), ["left"])
+    seen: list[str] = []
+    stands, goes_on = threading.Event(), threading.Event()
+
+    def stand_still() -> None:
+        stands.set()
+        goes_on.wait()
+        seen.append("goes on")
+
+    hub.on_tick(lambda now: seen.append("tick"))
+    hub.buses["left"].attach(lambda can_id, data: seen.append("frame"))
+    hub.start()
+    try:
+        with Client(hub, "left").listen() as client:
+            hub.soon(stand_still)
+            stands.wait()
+            client.say("< send 123 0 >")
+            NEVER.wait(0.2)
+            goes_on.set()
+            client.say("< echo >")
+            client.line()
+    finally:
+        hub.close()
+    assert seen[seen.index("goes on") + 1] == "frame"
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_hub_that_fails_leaves_nobody_waiting(hub: Hub) -> None:
     def fail() -> None:

@@ -127,6 +127,9 @@ class FactoryBackend(Backend):
             if_it_fails.callback(self._controller.close)
             for name in self.cell.cell.robots:
                 robot = self._controller.robot(name)
+                # A machine that stood still for a moment has had the drives miss this program's heartbeat.
+                if robot.read(timeout).mode is Mode.FAULT:
+                    robot.reset_fault(timeout)
                 if robot.read(timeout).mode is not Mode.READY:
                     robot.enable(timeout)
             self._camera.open(timeout)

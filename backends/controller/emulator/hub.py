@@ -19,6 +19,9 @@ from dualcal_hal.clock import Clock
 TICK = 0.005
 """Seconds between calls of those who do something at times of their own."""
 
+_PAUSE = 0.05
+"""Seconds within a turn that are no work but a machine which did something else."""
+
 _SHORTEST_SILENCE = 0.05
 """Seconds that a client which has sent nothing hears nothing: python-can takes a frame that comes together with the
 reply to its last command for a wrong reply."""
@@ -175,6 +178,7 @@ class Hub:
     def _turn(self, next_tick: float) -> float:
         """Do what has come, or wait for it until the next tick; returns when that is."""
         ready = self._selector.select(max(0.0, next_tick - self._clock.now()))
+        begin = self._clock.now()
         # First of all: what was asked for before a frame was sent is done before it is heard.
         while not self._calls.empty():
             self._calls.get()()
@@ -185,7 +189,8 @@ class Hub:
                 self._welcome()
             else:
                 self._woken.recv(4096)
-        if (now := self._clock.now()) >= next_tick:
+        # After a pause of its own what has come meanwhile is heard first, else those who look for it would miss it.
+        if (now := self._clock.now()) >= next_tick and now - begin < _PAUSE:
             next_tick = max(next_tick + TICK, now)
             for tick in self._ticks:
                 tick(now)

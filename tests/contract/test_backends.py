@@ -32,7 +32,7 @@ IN_EVERY_RUN = ("controller, rep", "controller, can")
 FACTORIES = [name if name in IN_EVERY_RUN else pytest.param(name, marks=pytest.mark.slow) for name in FACTORY_RIGS]
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def emulators(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Mapping[str, Any]]]:
     """Where the emulator of a rig serves it; each is started once."""
     with ExitStack() as running:

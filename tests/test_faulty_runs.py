@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import re
 import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -38,6 +42,20 @@ def test_a_drive_that_tells_an_emergency_stops_its_arm_by_name_and_code() -> Non
         where = cell.comes_to_rest()
         assert "left" in cell.served.faults.stops
         cell.stays(where)
+
+
+def test_no_search_of_a_large_heap_holds_up_drives_that_are_led() -> None:
+    large = [[] for _ in range(1_000_000)]
+    searched: list[int] = []
+
+    def note(phase: str, info: dict[str, int]) -> None:
+        if phase == "start" and info["generation"] == 2:
+            led = any(thread.name == "left CAN cycle" for thread in threading.enumerate())
+            searched.extend([len(gc.get_objects(generation=2))] if led else [])
+
+    with on_collection(note), guarded("can") as cell:
+        cell.start("left", *AWAY).wait(PATIENCE)
+    assert max(searched, default=0) < len(large)
 
 
 def test_the_lost_link_of_an_arm_that_stands_stops_the_one_that_moves() -> None:
@@ -179,6 +197,17 @@ def test_a_fault_ends_a_run_by_its_name_and_it_can_be_gone_on_with(link: str, fa
     case = next(case for case in cases(link) if case.fault == fault)
     (trial,), _ = tried(link, case, unhurried, 1)
     assert trial.wrong == []
+
+
+@contextmanager
+def on_collection(note: Callable[[str, dict[str, int]], None]) -> Iterator[None]:
+    """Have it told of each search of the heap, and what has been spared in it is not any more afterwards."""
+    gc.callbacks.append(note)
+    try:
+        yield
+    finally:
+        gc.callbacks.remove(note)
+        gc.unfreeze()
 
 
 def is_there(cell: Guarded) -> bool:

@@ -70,6 +70,8 @@ class ControllerBackend(Backend):
             raise UsageError(f"{self.name}: open: it is open already; close it first")
         deadline = self._clock.now() + timeout
         links = self._links()
+        # Before the first cycle begins: a large heap is searched for longer than drives go without a heartbeat.
+        spare_the_heap()
         with ExitStack() as if_it_fails:
             if_it_fails.enter_context(before_others())
             for arm, link in ((arm, links[arm]) for arm in arms):
@@ -78,7 +80,6 @@ class ControllerBackend(Backend):
                 if_it_fails.callback(self._robots[arm].detach)
                 self._robots[arm].attach(link)
             self._open = if_it_fails.pop_all()
-        spare_the_heap()
 
     def close(self) -> None:
         opened, self._open = self._open, None

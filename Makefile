@@ -16,7 +16,8 @@ run: setup
 	$(BIN)/dualcal run cells/paper.yaml
 
 test: setup
-	$(BIN)/python -m pytest -n 2 -m "not slow"
+	$(BIN)/python -m pytest -n 2 -m "not slow and not keeps_time"
+	$(BIN)/python -m pytest -n 3 -m "not slow and keeps_time"
 
 test-slow: setup
 	$(BIN)/python -m pytest -n 2 -m "slow and not keeps_time" --timeout 1800

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 from collections.abc import Iterator
@@ -34,19 +35,21 @@ KEEP_TIME = (
     "test_tcp_",
     "test_watch",
 )
-"""Tests on real clocks and wires: two of them side by side would be late for each other's sake."""
+"""Tests on real clocks and wires, which wait more than they compute: beside those that compute they would be late."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """A worker takes whole files, so that fixtures of a module are made once, and one takes all that keep time."""
     folder = Path(__file__).parent
     for item in items:
-        file = item.path.relative_to(folder).as_posix()
-        if file.startswith(KEEP_TIME):
+        if item.path.relative_to(folder).as_posix().startswith(KEEP_TIME):
             item.add_marker(pytest.mark.keeps_time)
-            file = "keeps time"
-        item.add_marker(pytest.mark.xdist_group(file))
+
+
+def pytest_collection_finish() -> None:
+    """All that was imported and collected stays: to search it now and then would hold up tests that keep time."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

@@ -328,7 +328,7 @@ def test_a_blurred_image_is_refused(detector: Detector, sigma: float, usable: bo
         assert missed(outcome).reason is Miss.BLURRED
 
 
-@pytest.mark.parametrize("length", [9, 13])
+@pytest.mark.parametrize("length", [9, pytest.param(13, marks=pytest.mark.slow)])
 def test_motion_along_one_direction_blurs_too(detector: Detector, length: int) -> None:
     for seed in range(10):
         image = cv2.blur(Scene(BOARD, CAMERA, np.random.default_rng(seed)).image(facing()), (length, 1))

@@ -106,7 +106,7 @@ def test_the_image_of_each_view_is_kept(session):
         assert Session(session).read_image(view["id"]).shape == (384, 512)
 
 
-@pytest.mark.parametrize("steps", [2, 30])
+@pytest.mark.parametrize("steps", [2, pytest.param(30, marks=pytest.mark.slow)])
 def test_a_run_that_goes_on_comes_to_the_same(session, interrupted, steps):
     folder = interrupted(steps)
     result = dualcal("run", "--resume", folder)
@@ -162,6 +162,7 @@ def test_looks_and_views_are_proposed_before_the_first_move_to_them(tmp_path):
     assert [key.kind for key, _ in session.journal.results()] == ["stand-off", "look", "look", "look", "plan"]
 
 
+@pytest.mark.slow
 def test_a_bowed_target_is_refused_without_a_patch(tmp_path):
     result = run(tmp_path / "s", "simulation.errors={flatness: {bow_mm: 8}}", options=["--no-log"])
     assert result.exit_code == 1, result.output

@@ -169,7 +169,7 @@ class TestEstimate:
 
 
 class TestResume:
-    @pytest.mark.parametrize("steps", [2, 7])
+    @pytest.mark.parametrize("steps", [pytest.param(2, marks=pytest.mark.slow), 7])
     def test_a_run_that_was_cut_off_comes_to_the_same_result(self, session, result, tmp_path, steps):
         folder = tmp_path / "cut"
         shutil.copytree(session, folder)

@@ -106,7 +106,7 @@ MOUNTS = [target_mount(1e-3, float(np.radians(0.3))), target_mount(np.inf, np.in
 class TestWithAMountThatIsOff:
     """Where what is wrong with the mount and with some captures has to be told apart."""
 
-    @pytest.mark.parametrize(("wrong", "seed"), [(3, 5), (5, 5), (5, 6)])
+    @pytest.mark.parametrize(("wrong", "seed"), [(3, 5), (5, 5), pytest.param(5, 6, marks=pytest.mark.slow)])
     def test_just_those_that_are_wrong_are_dropped(self, mount: Inexact, wrong: int, seed: int) -> None:
         data, out = shifted_on_another_mount(seed, wrong)
         found = refined(data, reference().knowns, NOISE, inexact=[mount])

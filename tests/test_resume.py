@@ -134,7 +134,7 @@ def test_a_run_that_is_interrupted_after_every_single_step_comes_to_the_same(ses
     assert came_to(tmp_path / "s") == came_to(session)
 
 
-@pytest.mark.parametrize("moves", [1, 4, 7])
+@pytest.mark.parametrize("moves", [1, *(pytest.param(moves, marks=pytest.mark.slow) for moves in (4, 7))])
 def test_a_run_that_is_interrupted_at_a_move_again_and_again_comes_to_the_same(session, tmp_path, lose_the_link, moves):
     lose_the_link(move=moves)
     result = run(tmp_path / "s")
@@ -148,6 +148,7 @@ def test_a_run_that_is_interrupted_at_a_move_again_and_again_comes_to_the_same(s
     assert came_to(tmp_path / "s") == came_to(session)
 
 
+@pytest.mark.slow
 def test_with_all_errors_of_real_cells_too_a_run_that_goes_on_comes_to_the_same(tmp_path, lose_the_link):
     whole = run(tmp_path / "whole", ALL_ERRORS)
     assert "Verdict" in whole.stdout
@@ -170,6 +171,7 @@ def test_each_step_alone_may_be_the_last_before_the_run_is_killed(session, inter
         shutil.rmtree(folder)
 
 
+@pytest.mark.slow
 def test_in_physics_a_run_that_goes_on_comes_to_the_same_within_a_hundredth_of_a_millimetre(tmp_path, lose_the_link):
     bullet = "simulation.stepper=bullet"
     assert run(tmp_path / "whole", bullet).exit_code == 0
@@ -241,7 +243,9 @@ def test_the_start_that_is_told_is_the_first_one(interrupted):
     assert read_captures(folder / "captures.json").started == started
 
 
-@pytest.mark.parametrize("left", ["nothing", "no byte", "half a line"])
+@pytest.mark.parametrize(
+    "left", [*(pytest.param(left, marks=pytest.mark.slow) for left in ("nothing", "no byte")), "half a line"]
+)
 def test_a_session_that_was_killed_before_its_first_step_is_begun_anew(session, interrupted, left):
     folder = interrupted(0)
     if left == "nothing":
@@ -268,7 +272,7 @@ def test_a_journal_that_does_not_say_how_the_steps_left_the_cell_is_gone_on_with
     assert after["transforms"] == before["transforms"]
 
 
-@pytest.mark.parametrize("steps", [0, 2, 7])
+@pytest.mark.parametrize("steps", [*(pytest.param(steps, marks=pytest.mark.slow) for steps in (0, 2)), 7])
 def test_a_session_whose_images_are_lost_goes_on(session, interrupted, steps):
     folder = interrupted(steps)
     shutil.rmtree(folder / "images")
@@ -676,7 +680,14 @@ def test_a_folder_that_cannot_be_written_to_is_told(interrupted):
     assert "cannot be written" in result.stderr
 
 
-@pytest.mark.parametrize("full", ["journal.jsonl", "calibration-01-0.png", "captures.json", "result.json"])
+@pytest.mark.parametrize(
+    "full",
+    [
+        "journal.jsonl",
+        "result.json",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("calibration-01-0.png", "captures.json")),
+    ],
+)
 def test_a_run_that_a_full_disk_ends_goes_on_once_there_is_room(session, tmp_path, monkeypatch, full):
     from dualcal_hal.session import files, folder
 

@@ -217,7 +217,9 @@ def run_small(folder, *overrides):
     return file, session
 
 
-@pytest.mark.parametrize("fails", ["calibration/00", "calibration/02", "verification/00"])
+@pytest.mark.parametrize(
+    "fails", ["calibration/00", pytest.param("calibration/02", marks=pytest.mark.slow), "verification/00"]
+)
 def test_after_a_replacement_the_plan_is_of_what_was_captured_in_its_order_and_by_its_own_transforms(
     tmp_path, monkeypatch, fails
 ):
@@ -693,7 +695,7 @@ def test_a_lost_link_ends_the_run_with_exit_code_1_and_keeps_what_was_captured(t
         (signal.SIGINT, False, "bullet"),
         (signal.SIGINT, True, "kinematic"),
         (signal.SIGTERM, False, "kinematic"),
-        (signal.SIGHUP, False, "kinematic"),
+        pytest.param(signal.SIGHUP, False, "kinematic", marks=pytest.mark.slow),
     ],
 )
 def test_a_signal_stops_the_arms_keeps_the_session_and_exits_with_130(tmp_path, number, ignored_before, stepper):

@@ -173,6 +173,14 @@ class TestRendered:
         assert_near(matrix(document, "camera_in_base"), IN_BASE)
         shown = dualcal("estimate", path).stdout
         assert "not used, the third:" in shown
+
+    @pytest.mark.slow
+    def test_a_view_with_the_pose_of_another_is_kept_where_all_are_and_makes_it_fail(
+        self, changed: Callable[[Change], Path]
+    ) -> None:
+        path = changed(
+            lambda document: document["views"][3].update(flange_in_base=document["views"][6]["flange_in_base"])
+        )
         kept = estimated(path, "--keep-all", "--sigma-flange", "0.5,0.05")
         assert all(view["used"] for view in kept["views"])
         assert kept["verdict"] == "fail"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -161,7 +162,31 @@ def test_an_outlier_is_named() -> None:
     B[17] = B[17] @ transform(np.eye(3), [0.1, 0.0, 0.0])
     found = estimate_triples(A, B, C, noise())
     assert int(np.argmax(found.squares)) == 17
-    assert "triple 17 alone has" in found.warnings[0]
+    assert "without triple 17, which contradicts the others, 0.961 times" in found.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("count", "wrong"), [(8, (4,)), (10, (0, 7)), (30, (3, 4, 11, 12, 28)), (30, tuple(range(10)))]
+)
+def test_all_that_contradict_the_others_are_named_and_none_beside(count: int, wrong: tuple[int, ...]) -> None:
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        A, B, C = (with_errors(rng, poses) for poses in random_triples(rng, count))
+        B[list(wrong)] = random_poses(rng, len(wrong))
+        names = [f"pose {index}" for index in range(count)]
+        with pytest.raises(Degenerate) as refused:
+            estimate_triples(A, B, C, noise(), names)
+        assert re.findall(r"pose \d+", str(refused.value)) == [names[index] for index in wrong][:8]
+        assert ("and 2 more" in str(refused.value)) == (len(wrong) == 10)
+        assert "leave out what contradicts" in str(refused.value)
+
+
+def test_where_all_are_worse_than_stated_none_is_named() -> None:
+    rng = np.random.default_rng(9)
+    A, B, C = (with_errors(rng, poses) for poses in random_triples(rng, 30))
+    found = estimate_triples(A, B, C, SMALL)
+    assert found.scale > 50
+    assert "contradict" not in found.warnings[0]
 
 
 def test_a_few_triples_turned_by_little_come_with_a_warning_where_first_order_is_not_enough() -> None:
@@ -248,7 +273,7 @@ def test_poses_that_do_not_belong_together_are_refused_and_not_averaged(mistake:
     rng = np.random.default_rng(4)
     A, B, C = (with_errors(rng, poses) for poses in random_triples(rng, 40))
     B = inverse(B) if mistake == "inverted" else np.roll(B, 1, axis=0)
-    with pytest.raises(Degenerate, match="do not fit AXB = YCZ"):
+    with pytest.raises(Degenerate, match=r"do not fit AXB = YCZ: .* check what A, B and C are"):
         estimate_triples(A, B, C, noise())
 
 

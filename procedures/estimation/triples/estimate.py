@@ -13,6 +13,7 @@ from dualcal_hal.transforms import Array, inverse
 from procedures.estimation.degenerate import Degenerate
 from procedures.estimation.refined.motion import adjoint
 from procedures.estimation.triples.closed_form import Solution, find_start
+from procedures.estimation.triples.contradiction import Contradiction, find_contradiction
 from procedures.estimation.triples.degeneracy import (
     FEWEST_TRIPLES,
     UNCERTAIN,
@@ -24,7 +25,7 @@ from procedures.estimation.triples.degeneracy import (
     weakest,
 )
 from procedures.estimation.triples.noise import TripleNoise, root
-from procedures.estimation.triples.refinement import UNKNOWNS, Linearised, Measured, minimise, rise_by_one_sigma
+from procedures.estimation.triples.refinement import UNKNOWNS, Measured, minimise, rise_by_one_sigma
 
 __all__ = ["FEWEST_TRIPLES", "TripleEstimate", "estimate_triples"]
 
@@ -34,6 +35,8 @@ _LINEAR = 2.0
 
 _SURPRISE = 0.0005  # probability of residuals so large, or so small, if the noise is as stated
 _MISFIT = "the triples do not fit AXB = YCZ"
+_TOO_LARGE = "the residuals are {:.3g} times what the stated noise explains"
+_MOST_NAMED = 8
 _ADVICE = "check what A, B and C are, their directions (B: the target in the camera), their order and their units"
 
 
@@ -107,8 +110,11 @@ def estimate_triples(
     refuse_uncertain(covariance)
     if not noise_fits:
         covariance *= max(1.0, scale**2)
+    contradiction = None if noise_fits or scale < 1 else find_contradiction(measured)
+    misfit = "" if noise_fits else _misfit(scale, contradiction, names or range(len(A)))
     if not converged or weakest(covariance, UNCERTAIN):
-        raise Degenerate(f"{_MISFIT}: the residuals are {scale:.3g} times what the stated noise explains; {_ADVICE}")
+        advice = _ADVICE if contradiction is None else "correct or leave out what contradicts"
+        raise Degenerate(f"{_MISFIT}: {misfit or _TOO_LARGE.format(scale)}; {advice}")
     rise = rise_by_one_sigma(measured, state, at)
     return TripleEstimate(
         X=state.solution.X,
@@ -123,7 +129,7 @@ def estimate_triples(
         start=start,
         conditioning=condition,
         rise=rise,
-        warnings=_warnings(at, covariance, scale, noise_fits, rise, names or range(len(A))),
+        warnings=_warnings(covariance, misfit, rise),
     )
 
 
@@ -150,18 +156,19 @@ def _judge_noise(cost: float, freedom: int) -> tuple[float, bool]:
     return float(np.sqrt(cost / freedom)), bool(fits)
 
 
-def _warnings(
-    at: Linearised, covariance: Array, scale: float, noise_fits: bool, rise: float, names: Sequence[object]
-) -> tuple[str, ...]:
-    said = []
-    if not noise_fits:
-        share = at.squares.max() / at.cost
-        worst = (
-            f"; triple {names[int(at.squares.argmax())]} alone has {100 * share:.0f} % of the cost"
-            if share > 0.2
-            else ""
-        )
-        said.append(f"the residuals are {scale:.3g} times what the stated noise explains{worst}")
+def _misfit(scale: float, found: Contradiction | None, names: Sequence[object]) -> str:
+    """In words, with the triples that it is the fault of if it is that of some."""
+    told = _TOO_LARGE.format(scale)
+    if found is None:
+        return told
+    odd = ", ".join(str(names[index]) for index in found.odd[:_MOST_NAMED])
+    more = f" and {len(found.odd) - _MOST_NAMED} more" if len(found.odd) > _MOST_NAMED else ""
+    which = f"triple {odd}, which contradicts" if len(found.odd) == 1 else f"triples {odd}{more}, which contradict"
+    return f"{told}, and without {which} the others, {found.scale:.3g} times"
+
+
+def _warnings(covariance: Array, misfit: str, rise: float) -> tuple[str, ...]:
+    said = [misfit] if misfit else []
     if uncertain := weakest(covariance, WEAK):
         said.append(f"{uncertain}: turn both flanges by more, about two axes each, or take more triples")
     if rise > _LINEAR:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dualcal_hal.transforms import Array, inverse, rotation_from_vector, skew
 from procedures.estimation.refined.motion import adjoint, motion_between, moved
@@ -36,6 +37,16 @@ class Measured:
     root_C: Array
     covariance_B: Array
     precision_B: Array
+
+    def some(self, indices: NDArray[np.intp]) -> Measured:
+        """Those triples alone."""
+        of_each = (self.root_A, self.root_C, self.covariance_B, self.precision_B)
+        return Measured(
+            self.A[indices],
+            self.B[indices],
+            self.C[indices],
+            *(each[indices] if len(each) == len(self.A) else each for each in of_each),
+        )
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
+from scipy.special import chdtr, chdtri
 
 from dualcal_hal.transforms import Array
 from procedures.estimation.triples.closed_form import Solution, find_start
-from procedures.estimation.triples.degeneracy import DEGENERATE, conditioning
+from procedures.estimation.triples.degeneracy import DEGENERATE, UNCERTAIN, conditioning, weakest
 from procedures.estimation.triples.refinement import UNKNOWNS, Linearised, Measured, State, linearised, minimise
 
 FEWEST_THAT_AGREE = 6
@@ -22,6 +22,7 @@ _ROUNDS = 5
 
 _FARTHEST = float(chdtri(6, 1e-5))  # the square that one of 100,000 good triples exceeds
 _MEDIAN = float(chdtri(6, 0.5))
+_TOO_WELL = 1e-5  # probability of residuals so small
 
 
 Indices = NDArray[np.intp]
@@ -59,9 +60,17 @@ def find_contradiction(measured: Measured) -> Contradiction | None:
             return None
         if np.array_equal(before, fits):
             odd = np.setdiff1d(np.arange(n), fits)
-            scale = float(np.sqrt(at.cost / (6 * len(fits) - UNKNOWNS)))
-            return Contradiction(tuple(odd.tolist()), scale) if 0 < len(odd) < len(fits) else None
+            return _if_it_shows(odd, len(fits), at) if 0 < len(odd) < len(fits) else None
     return None
+
+
+def _if_it_shows(odd: Indices, agreeing: int, at: Linearised) -> Contradiction | None:
+    """None where those that agree do so by chance: so badly that nothing is determined, or better than noise lets."""
+    freedom = 6 * agreeing - UNKNOWNS
+    scale = float(np.sqrt(at.cost / freedom))
+    covariance = np.asarray(np.linalg.inv(at.normal), dtype=float) * max(1.0, scale) ** 2
+    by_chance = weakest(covariance, UNCERTAIN) or chdtr(freedom, at.cost) < _TOO_WELL
+    return None if by_chance else Contradiction(tuple(odd.tolist()), scale)
 
 
 def _start(measured: Measured) -> Solution:

@@ -131,6 +131,7 @@ class Hub:
         self._ticks: list[Callable[[float], None]] = []
         self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._closing = False
+        self._paused = False
         self._listener = socket.create_server(("127.0.0.1", port))
         self._listener.setblocking(False)
         self.port: int = self._listener.getsockname()[1]
@@ -189,8 +190,11 @@ class Hub:
                 self._welcome()
             else:
                 self._woken.recv(4096)
-        # After a pause of its own what has come meanwhile is heard first, else those who look for it would miss it.
-        if (now := self._clock.now()) >= next_tick and now - begin < _PAUSE:
+        # After a pause of its own what has come meanwhile is heard first, else those who look for it would miss it; but
+        # not time and again, where so much comes.
+        now = self._clock.now()
+        self._paused = now - begin >= _PAUSE and not self._paused
+        if now >= next_tick and not self._paused:
             next_tick = max(next_tick + TICK, now)
             for tick in self._ticks:
                 tick(now)

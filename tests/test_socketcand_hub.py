@@ -262,6 +262,30 @@ def test_what_came_while_the_hub_stood_still_is_heard_before_anybody_looks_for_i
     assert seen[seen.index("goes on") + 1] == "frame"
 
 
+def test_a_hub_that_hears_without_end_ticks_all_the_same() -> None:
+    hub = Hub(RealClock(), ["left"])
+    seen: list[str] = []
+
+    def hear_slowly(can_id: int, data: bytes) -> None:
+        seen.append("frame")
+        NEVER.wait(0.06)
+
+    hub.on_tick(lambda now: seen.append("tick"))
+    hub.buses["left"].attach(hear_slowly)
+    hub.start()
+    try:
+        with Client(hub, "left") as client:
+            for _ in range(20):
+                client.say("< send 123 0 >")
+                NEVER.wait(0.02)
+            client.say("< echo >")
+            client.line()
+    finally:
+        hub.close()
+    within = seen[seen.index("frame") : len(seen) - seen[::-1].index("frame")]
+    assert "tick" in within
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_hub_that_fails_leaves_nobody_waiting(hub: Hub) -> None:
     def fail() -> None:
